@@ -1,0 +1,161 @@
+"""Speed on the CPU, in one run: the network alone, `register` batched, single and large, and Open3D's ICP beside it.
+
+    python experiments/benchmarks/speed.py [--data PATH] [--pairs 256]
+
+Pairs follow the clean DCP protocol, 1,024 points, on the test split of PATH (procedural shapes by default). Each figure
+is the median of its repeats, after a warm-up that compiles. Open3D is optional: `pip install 'urrt-jax[peers]'`.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from urrt_jax import load_model, model_card, register
+from urrt_jax.data import demo_shape, find_data, load_shapes
+from urrt_jax.evaluation import PROTOCOLS, pose_errors, summarize
+from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax.model.network import predict
+
+HERE = Path(__file__).parent
+BATCH = 64
+LARGE = (80_000, 400_000)
+OPEN3D_RADIUS, OPEN3D_ITERATIONS = 0.5, 50
+
+
+def seconds(function: Callable[[], object], repeats: int) -> float:
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def open3d_icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Open3D's point-to-point ICP, started at the centroids; the matrix (4, 4)."""
+    import open3d
+
+    clouds = []
+    for points in (source, target):
+        cloud = open3d.geometry.PointCloud()
+        cloud.points = open3d.utility.Vector3dVector(points)
+        clouds.append(cloud)
+    start = np.eye(4)
+    start[:3, 3] = target.mean(axis=0) - source.mean(axis=0)
+    method = open3d.pipelines.registration
+    criteria = method.ICPConvergenceCriteria(max_iteration=OPEN3D_ITERATIONS)
+    estimation = method.TransformationEstimationPointToPoint()
+    return method.registration_icp(*clouds, OPEN3D_RADIUS, start, estimation, criteria).transformation
+
+
+def measure(data: str, pairs: int, repeats: int) -> dict:
+    shapes = load_shapes(data, split="test", points=1024, limit=pairs)
+    trials = [PROTOCOLS["dcp"](shapes.points, item) for item in range(len(shapes))]
+    sources, targets, rotations, translations = (np.stack(values) for values in zip(*trials, strict=True))
+    model = load_model()
+
+    network = jax.jit(jax.vmap(lambda a, b: predict(model, make_cloud(a), make_cloud(b))))
+    refined = jax.jit(jax.vmap(lambda a, b: register(a, b, model=model)))
+    batches: list[tuple[jax.Array, jax.Array]] = [
+        (jnp.asarray(sources[start : start + BATCH]), jnp.asarray(targets[start : start + BATCH]))
+        for start in range(0, len(sources) - BATCH + 1, BATCH)
+    ]
+    count = BATCH * len(batches)
+
+    def run_all(function: Callable) -> list:
+        return jax.block_until_ready([function(*batch) for batch in batches])
+
+    rows = []
+    for name, function in (("network alone, batches of 64", network), ("register, batches of 64", refined)):
+        took = seconds(lambda function=function: run_all(function), repeats)
+        results = run_all(function)
+        found = [np.concatenate([getattr(r, key) for r in results]) for key in ("rotation", "translation")]
+        errors = pose_errors(found[0], found[1], rotations[:count], translations[:count])
+        rows.append(row(name, took / count, summarize(errors)["recall_1deg"]))
+
+    single, pair = [], (jnp.asarray(sources[0]), jnp.asarray(targets[0]))
+    jax.block_until_ready(register(pair[0], pair[1]))
+    for item in tqdm(range(min(count, 64)), desc="one pair a call"):
+        pair = jnp.asarray(sources[item]), jnp.asarray(targets[item])
+        start = time.perf_counter()
+        jax.block_until_ready(register(pair[0], pair[1]))
+        single.append(time.perf_counter() - start)
+    rows.append(row("register, one pair a call", statistics.median(single), None))
+
+    for size in LARGE:
+        cloud = demo_shape(size)
+        turn = Rotation.from_euler("zyx", [10, 20, 30], degrees=True).as_matrix()
+        pair = jnp.asarray(cloud[::2]), jnp.asarray((cloud[1::2] @ turn.T + 0.1).astype(np.float32))
+        took = seconds(lambda pair=pair: jax.block_until_ready(register(pair[0], pair[1])), 1)
+        rows.append(row(f"register, one pair of {size // 2:,} points", took, None))
+
+    try:
+        import open3d
+    except ImportError as error:
+        rows.append({"method": f"Open3D ICP: not measured ({error}); pip install 'urrt-jax[peers]'"})
+    else:
+        single, matrices = [], []
+        for item in tqdm(range(count), desc="Open3D ICP"):
+            start = time.perf_counter()
+            matrices.append(open3d_icp(sources[item].astype(np.float64), targets[item].astype(np.float64)))
+            single.append(time.perf_counter() - start)
+        stacked = np.stack(matrices)
+        errors = pose_errors(stacked[:, :3, :3], stacked[:, :3, 3], rotations[:count], translations[:count])
+        name = f"Open3D {open3d.__version__} ICP from the centroids, one pair a call"
+        rows.append(row(name, statistics.mean(single), summarize(errors)["recall_1deg"]))
+    return {
+        "command": f"python experiments/benchmarks/speed.py --pairs {pairs} --repeats {repeats}",
+        "data": Path(data).name,
+        "pairs": count,
+        "points": 1024,
+        "cores": os.cpu_count(),
+        "processor": platform.processor() or platform.machine(),
+        "device": str(jax.devices()[0].platform),
+        "jax": jax.__version__,
+        "model_sha256": model_card()["sha256"],
+        "rows": rows,
+    }
+
+
+def row(method: str, seconds_a_pair: float, recall: float | None) -> dict:
+    return {
+        "method": method,
+        "milliseconds_a_pair": round(1e3 * seconds_a_pair, 3),
+        "pairs_per_second": round(1 / seconds_a_pair, 1),
+        "recall_1deg": None if recall is None else round(recall, 4),
+    }
+
+
+def as_markdown(result: dict) -> str:
+    lines = ["| method | pairs/s | ms a pair | recall at 1° |", "|---|---|---|---|"]
+    for each in result["rows"]:
+        if "pairs_per_second" not in each:
+            lines.append(f"| {each['method']} | | | |")
+            continue
+        recall = "" if each["recall_1deg"] is None else f"{each['recall_1deg']:.3f}"
+        lines.append(f"| {each['method']} | {each['pairs_per_second']} | {each['milliseconds_a_pair']} | {recall} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", help="ModelNet40 as 'urrt evaluate' takes it; by default $URRT_DATA, else procedural")
+    parser.add_argument("--pairs", type=int, default=256, help="how many pairs, a multiple of 64")
+    parser.add_argument("--repeats", type=int, default=5, help="timed repeats of the batched rows")
+    given = parser.parse_args()
+    result = measure(find_data(given.data), given.pairs, given.repeats)
+    (HERE / "speed.json").write_text(json.dumps(result, indent=2) + "\n")
+    (HERE / "speed.md").write_text(as_markdown(result))
+    print(as_markdown(result))

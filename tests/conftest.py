@@ -1,0 +1,105 @@
+"""What several tests share: an asymmetric cloud, a pose, a small network that does not answer the identity."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import settings
+from scipy.spatial.transform import Rotation
+
+from urrt_jax import Model, ModelConfig
+from urrt_jax.model import init_model
+
+# The first example of a test compiles; deadlines would measure the compiler.
+settings.register_profile("urrt", deadline=None, max_examples=25, derandomize=True, database=None)
+settings.load_profile("urrt")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "slow: takes tens of seconds; leave out with -m 'not slow'")
+
+
+def _asymmetric_cloud(seed: int = 0, scale: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+
+    def sphere(count: int) -> np.ndarray:
+        directions = rng.normal(size=(count * scale, 3))
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+    body = sphere(110) * np.array([1.0, 0.7, 0.45])
+    head = 0.3 * sphere(60) + np.array([0.9, 0.5, 0.35])
+    stick = np.outer(rng.uniform(0, 1, 30 * scale), [-0.3, 0.2, 0.9]) + np.array([-0.5, 0, 0.3])
+    stick += 0.03 * rng.normal(size=stick.shape)
+    return np.concatenate([body, head, stick]).astype(np.float32)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_compiled_programs():
+    """Hundreds of compiled programs would otherwise stay in memory until the last test."""
+    yield
+    jax.clear_caches()
+
+
+@pytest.fixture(scope="session")
+def make_cloud_points():
+    """A function of (seed, scale): an asymmetric cloud of 200·scale points, (N, 3) float32."""
+    return _asymmetric_cloud
+
+
+@pytest.fixture(scope="session")
+def cloud() -> np.ndarray:
+    """200 points of a shape without any symmetry, (200, 3) float32."""
+    points = _asymmetric_cloud()
+    points.flags.writeable = False
+    return points
+
+
+@pytest.fixture(scope="session")
+def pose() -> tuple[np.ndarray, np.ndarray]:
+    """A turn by 10 degrees and a translation, float64."""
+    axis = np.array([0.3, -0.5, 0.8])
+    return Rotation.from_rotvec(np.deg2rad(10) * axis / np.linalg.norm(axis)).as_matrix(), np.array([0.2, -0.1, 0.3])
+
+
+@pytest.fixture(scope="session")
+def small_config() -> ModelConfig:
+    return ModelConfig(
+        regions=4,
+        width=16,
+        encoder_widths=(16,),
+        branch_width=8,
+        position_widths=(8,),
+        decoder_widths=(16,),
+        steps=2,
+        points=64,
+    )
+
+
+_init = jax.jit(init_model, static_argnums=1)
+
+
+def _perturbed(config: ModelConfig, seed: int = 0) -> Model:
+    model = _init(jax.random.key(seed), config)
+    leaves, tree = jax.tree.flatten(model.params)
+    keys = jax.random.split(jax.random.key(seed + 100), len(leaves))
+    leaves = [leaf + 0.05 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+    return Model(config, jax.tree.unflatten(tree, leaves))
+
+
+@pytest.fixture(scope="session")
+def make_model():
+    """A function of (config, seed): a model with perturbed parameters."""
+    return _perturbed
+
+
+@pytest.fixture(scope="session")
+def small_model(small_config: ModelConfig) -> Model:
+    """A network with random parameters whose estimates are not the identity."""
+    return _perturbed(small_config)
+
+
+@pytest.fixture
+def x64():
+    """Double precision within one test, for sharp finite differences."""
+    with jax.enable_x64(True):
+        yield jnp.float64

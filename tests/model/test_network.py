@@ -1,0 +1,446 @@
+"""The network's invariances, its derivatives, and what each stage does with regions that hold no point."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import make_cloud, normalize_pair
+from urrt_jax.model import Model, ModelConfig, estimate, init_model
+from urrt_jax.model.attention import attention_weights
+from urrt_jax.model.decoder import fuse, fusion_weights
+from urrt_jax.model.encoder import shape_embedding
+from urrt_jax.model.network import encode, point_regions, predict
+from urrt_jax.model.partition import (
+    branch_logits,
+    occupancy_logits,
+    pool_by_label,
+    region_labels,
+    region_scores,
+    split_regions,
+)
+from urrt_jax.training.pairs import PairConfig, make_pair
+from urrt_jax.training.state import TrainConfig
+from urrt_jax.training.step import pair_loss
+
+_predict = jax.jit(predict)
+_estimate = jax.jit(estimate)
+_init = jax.jit(init_model, static_argnums=1)
+
+
+def _is_rotation(matrix, atol=1e-5):
+    matrix = np.asarray(matrix, np.float64)
+    np.testing.assert_allclose(matrix.T @ matrix, np.eye(3), atol=atol)
+    assert np.linalg.det(matrix) == pytest.approx(1, abs=atol)
+
+
+def _close(first, second, atol=1e-5):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), first, second)
+
+
+@pytest.fixture(scope="module", params=["A", "B", "C"])
+def model(request, small_config, make_model) -> Model:
+    return make_model(dataclasses.replace(small_config, variant=request.param))
+
+
+@pytest.fixture(scope="module")
+def pair(cloud, pose):
+    """Two clouds of 60 points, fewer than the network's size, the second one posed."""
+    target = cloud[100:160] @ pose[0].T + pose[1]
+    return cloud[:60].copy(), target.astype(np.float32)
+
+
+def test_random_model_does_not_answer_the_identity(model, pair):
+    answer = _predict(model, *map(make_cloud, pair))
+    assert float(rigid.rotation_angle(answer.rotation, jnp.eye(3))) > 0.01
+
+
+def test_answer_is_a_rotation(model, pair):
+    _is_rotation(_predict(model, *map(make_cloud, pair)).rotation)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_answer_does_not_depend_on_the_order_of_points(model, pair, which):
+    clouds = list(pair)
+    clouds[which] = np.random.default_rng(0).permutation(clouds[which])
+    _close(_predict(model, *map(make_cloud, clouds)), _predict(model, *map(make_cloud, pair)))
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_order_does_not_matter_when_the_cloud_is_subsampled(small_model, cloud, which):
+    clouds = [cloud, cloud + np.float32(0.1)]
+    shuffled = list(clouds)
+    shuffled[which] = np.random.default_rng(0).permutation(cloud) + np.float32(0.1 * which)
+    _close(
+        _predict(small_model, *map(make_cloud, shuffled)), _predict(small_model, *map(make_cloud, clouds)), atol=1e-4
+    )
+
+
+def test_padding_changes_nothing(model, pair):
+    padded = [np.concatenate([points, np.full((4, 3), 7.0, np.float32)]) for points in pair]
+    mask = np.arange(64) < 60
+    _close(_predict(model, *(make_cloud(p, mask) for p in padded)), _predict(model, *map(make_cloud, pair)))
+
+
+def test_jit_agrees_with_eager(small_model, pair):
+    clouds = tuple(map(make_cloud, pair))
+    _close(_predict(small_model, *clouds), predict(small_model, *clouds))
+
+
+def test_vmap_agrees_with_a_loop(model, pair, cloud):
+    sources, targets = np.stack([pair[0], cloud[60:120]]), np.stack([pair[1], cloud[120:180]])
+    together = jax.vmap(lambda s, t: predict(model, make_cloud(s), make_cloud(t)))(sources, targets)
+    for i in range(2):
+        alone = _predict(model, make_cloud(sources[i]), make_cloud(targets[i]))
+        _close(jax.tree.map(lambda leaf, i=i: leaf[i], together), alone)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_common_scale_keeps_the_rotation_and_scales_the_translation(model, pair, scale):
+    plain = _predict(model, *map(make_cloud, pair))
+    scaled = _predict(model, *(make_cloud(points * np.float32(scale)) for points in pair))
+    np.testing.assert_allclose(scaled.rotation, plain.rotation, atol=1e-4)
+    np.testing.assert_allclose(scaled.translation / scale, plain.translation, atol=1e-4)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_moving_a_cloud_moves_the_answer(model, pair, which):
+    offset = np.array([1000.0, -500.0, 250.0])
+    # Rounded to the grid that float32 has at 1000, so that both problems are the same one.
+    clouds = [np.round(points * 2**12) / 2**12 for points in pair]
+    plain = _predict(model, *(make_cloud(points.astype(np.float32)) for points in clouds))
+    clouds[which] = clouds[which] + offset
+    moved = _predict(model, *(make_cloud(points.astype(np.float32)) for points in clouds))
+    np.testing.assert_allclose(moved.rotation, plain.rotation, atol=1e-4)
+    # Where a point of the source lands, rather than the translation: that multiplies the rotation's rounding by 1000.
+    landed = rigid.apply(moved, jnp.asarray(clouds[0][:5], jnp.float32))
+    expected = rigid.apply(plain, jnp.asarray(clouds[0][:5] - offset * (which == 0), jnp.float32)) + offset * which
+    np.testing.assert_allclose(landed, expected, atol=1e-3)
+
+
+def test_steps_end_in_the_answer(small_model, pair):
+    source, target, _ = normalize_pair(*map(make_cloud, pair))
+    answer = _estimate(small_model, source, target)
+    assert answer.steps.rotation.shape == (2, 3, 3)
+    _close(jax.tree.map(lambda leaf: leaf[-1], answer.steps), answer.transform, atol=0)
+
+
+def test_second_step_starts_where_the_first_ended(small_model, pair):
+    source, target, _ = normalize_pair(*map(make_cloud, pair))
+    answer = _estimate(small_model, source, target)
+    _close(jax.tree.map(lambda leaf: leaf[0], answer.steps), answer.seen, atol=0)
+
+
+def _degenerate() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    sphere = rng.normal(size=(60, 3))
+    cube = np.stack(np.meshgrid(*[[-1.0, 0, 1]] * 3), -1).reshape(-1, 3)
+    return {
+        "sphere": sphere / np.linalg.norm(sphere, axis=1, keepdims=True),
+        "cube": cube,
+        "one point repeated": np.ones((60, 3)),
+        "at the origin": np.zeros((60, 3)),
+        "line": np.outer(np.linspace(-1, 1, 40), [1.0, 2, 3]),
+    }
+
+
+@pytest.mark.parametrize("name", ["identity", *_degenerate()])
+def test_gradient_is_finite_for_equal_clouds(model, pair, name):
+    points = jnp.asarray(pair[0] if name == "identity" else _degenerate()[name], jnp.float32)
+
+    def total(params, source):
+        answer = predict(Model(model.config, params), make_cloud(source), make_cloud(points))
+        return jnp.sum(answer.rotation * jnp.arange(9.0).reshape(3, 3)) + jnp.sum(answer.translation)
+
+    value, gradients = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(model.params, points)
+    assert bool(jnp.isfinite(value))
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(gradients))
+
+
+def test_gradient_in_the_parameters_agrees_with_finite_differences(model, pair):
+    """Of one step: between steps no derivative passes, by design. The partition stays, so that no label switches."""
+    one_step = dataclasses.replace(model.config, steps=1)
+    leaves, tree = jax.tree.flatten({k: v for k, v in model.params.items() if k != "partition"})
+    rng = np.random.default_rng(0)
+    along = jax.tree.unflatten(tree, [jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in leaves])
+
+    @jax.jit
+    def total(step):
+        moved = {k: jax.tree.map(lambda a, b: a + step * b, model.params[k], along[k]) for k in along}
+        answer = predict(Model(one_step, model.params | moved), *map(make_cloud, pair))
+        return jnp.sum(answer.rotation * jnp.arange(9.0).reshape(3, 3)) + jnp.sum(answer.translation)
+
+    step = 2e-4
+    difference = float(total(step) - total(-step)) / (2 * step)
+    assert float(jax.grad(total)(0.0)) == pytest.approx(difference, rel=0.03, abs=0.03)
+
+
+def test_estimate_has_no_derivative_in_the_partition(small_model, pair):
+    def total(partition):
+        params = small_model.params | {"partition": partition}
+        return jnp.sum(predict(Model(small_model.config, params), *map(make_cloud, pair)).rotation)
+
+    gradient = jax.grad(total)(small_model.params["partition"])
+    assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.fixture(scope="module")
+def loss_gradient(small_model, cloud):
+    """A function of the occupancy weight: the gradient of the mean training loss of four pairs."""
+    pairs = PairConfig(points=64)
+    batch = jax.vmap(lambda key: make_pair(key, jnp.asarray(cloud), pairs, 0.0))(jax.random.split(jax.random.key(0), 4))
+
+    config = TrainConfig(
+        model=small_model.config, pairs=pairs, loss_points=64, occupancy_queries=64, occupancy_weight=0.0
+    )
+
+    def losses(params):
+        model = Model(config.model, params)
+        _, metrics = jax.vmap(lambda one: pair_loss(model, one, jax.random.key(1), config))(batch)
+        return jnp.array([jnp.mean(metrics["loss"]), jnp.mean(metrics["occupancy"])])
+
+    jacobian = jax.jit(jax.jacrev(losses))(small_model.params)
+    parts = [jax.tree.map(lambda leaf, i=i: leaf[i], jacobian) for i in range(2)]
+
+    def gradient(weight: float):
+        return jax.tree.map(lambda a, b: a + weight * b, *parts)
+
+    return gradient
+
+
+def test_every_parameter_receives_a_gradient_from_the_training_loss(loss_gradient):
+    idle = [
+        jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(loss_gradient(1.0))
+        if not bool(jnp.any(leaf)) or not bool(jnp.all(jnp.isfinite(leaf)))
+    ]
+    # A bias that is the same for all keys cancels in a softmax; this network has none.
+    assert idle == []
+
+
+def test_partition_learns_from_occupancy_alone(loss_gradient):
+    assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(loss_gradient(0.0)["partition"]))
+
+
+def _region_inputs(seed: int = 0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(4, 8)).astype(np.float32), rng.normal(size=(4, 8)).astype(np.float32)
+
+
+def test_attention_rows_sum_to_one():
+    weights = attention_weights(*map(jnp.asarray, _region_inputs()), jnp.array([True, False, True, True]))
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+
+
+def test_attention_passes_over_absent_regions():
+    weights = attention_weights(*map(jnp.asarray, _region_inputs()), jnp.array([True, False, True, False]))
+    np.testing.assert_array_equal(weights[:, [1, 3]], 0)
+
+
+def test_attention_without_any_region_is_zero():
+    weights = attention_weights(*map(jnp.asarray, _region_inputs()), jnp.zeros(4, bool))
+    np.testing.assert_array_equal(weights, 0)
+
+
+def test_attention_without_any_region_has_a_finite_gradient():
+    query, key = map(jnp.asarray, _region_inputs())
+    gradient = jax.grad(lambda q: jnp.sum(attention_weights(q, key, jnp.zeros(4, bool))))(query)
+    assert bool(jnp.all(jnp.isfinite(gradient)))
+
+
+def test_attention_is_the_scaled_softmax_of_the_paper():
+    query, key = _region_inputs()
+    logits = query @ key.T / np.sqrt(8)
+    expected = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    np.testing.assert_allclose(
+        attention_weights(*map(jnp.asarray, (query, key)), jnp.ones(4, bool)), expected, atol=1e-6
+    )
+
+
+@pytest.fixture(scope="module")
+def one_sided(small_config):
+    """A model of many regions and a cloud so small that most of them stay empty."""
+    config = dataclasses.replace(small_config, regions=12)
+    points = np.random.default_rng(0).normal([2, 2, 2], 0.1, size=(20, 3)).astype(np.float32)
+    return _init(jax.random.key(0), config), make_cloud(points)
+
+
+def test_empty_region_has_features_and_centroid_zero(one_sided):
+    encoding = encode(*one_sided)
+    empty = np.asarray(encoding.regions.counts) == 0
+    assert 0 < empty.sum() < 12
+    for values in (encoding.regions.features, encoding.regions.centroids):
+        np.testing.assert_array_equal(np.asarray(values)[empty], 0)
+
+
+def test_empty_regions_leave_the_answer_finite(one_sided):
+    model, cloud = one_sided
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(_estimate(model, cloud, cloud)))
+
+
+def test_empty_cloud_leaves_the_answer_finite(model, pair):
+    nothing = make_cloud(pair[0], np.zeros(60, bool))
+    answer = _predict(model, nothing, make_cloud(pair[1]))
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(answer))
+
+
+def test_fusion_weighs_regions_by_their_points():
+    weights = fusion_weights(jnp.array([10.0, 20, 30]), jnp.array([20.0, 20, 0]))
+    np.testing.assert_allclose(weights, [30 / 70, 40 / 70, 0], atol=1e-6)
+
+
+def test_fusion_without_a_shared_region_falls_back_to_counts():
+    weights = fusion_weights(jnp.array([10.0, 0]), jnp.array([0.0, 30]))
+    np.testing.assert_allclose(weights, [0.25, 0.75], atol=1e-6)
+
+
+def test_fusion_of_nothing_is_finite():
+    np.testing.assert_array_equal(fusion_weights(jnp.zeros(3), jnp.zeros(3)), 0)
+
+
+@given(st.integers(0, 2**31 - 1))
+def test_fusion_gives_a_rotation(seed):
+    rng = np.random.default_rng(seed)
+    codes = jnp.asarray(rng.normal(size=(4, 9)), jnp.float32)
+    _is_rotation(fuse(codes, jnp.asarray(rng.dirichlet(np.ones(4)), jnp.float32)).rotation, atol=1e-4)
+
+
+def test_fusion_of_equal_transforms_is_that_transform():
+    turn = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
+    code = np.concatenate([turn[:, 0], turn[:, 1], [1, 2, 3]]).astype(np.float32)
+    fused = fuse(jnp.tile(code, (3, 1)), jnp.array([0.2, 0.5, 0.3]))
+    _close(fused, rigid.Rigid(turn, np.array([1.0, 2, 3])), atol=1e-6)
+
+
+def test_labels_are_regions(small_model, pair):
+    cloud = make_cloud(pair[0])
+    logits = branch_logits(small_model.config, small_model.params["partition"], cloud.points, jnp.zeros(16))
+    labels = region_labels(logits)
+    assert labels.dtype == jnp.int32
+    assert int(labels.min()) >= 0
+    assert int(labels.max()) < 4
+
+
+def test_label_is_the_region_of_the_highest_score():
+    logits = jnp.asarray(_region_inputs()[0])
+    np.testing.assert_array_equal(region_labels(logits), np.argmax(region_scores(logits), axis=1))
+
+
+def test_fresh_partition_uses_every_region(small_config):
+    config = dataclasses.replace(small_config, regions=8, branch_width=32)
+    fresh = _init(jax.random.key(0), config)
+    ball = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32)
+    encoding = encode(fresh, make_cloud(ball))
+    assert int(jnp.sum(encoding.regions.counts > 20)) == 8
+
+
+def test_labels_have_no_derivative(small_model, pair):
+    def total(points):
+        logits = branch_logits(small_model.config, small_model.params["partition"], points, jnp.zeros(16))
+        return jnp.sum(region_labels(logits).astype(jnp.float32))
+
+    assert not bool(jnp.any(jax.grad(total)(jnp.asarray(pair[0]))))
+
+
+def test_occupancy_can_say_outside():
+    assert float(occupancy_logits(jnp.array([-3.0, -5.0]))) == -3
+
+
+def test_point_regions_in_chunks_agree_with_all_at_once(small_model, pair):
+    cloud = make_cloud(pair[0])
+    encoding = encode(small_model, cloud)
+    chunked = point_regions(small_model, cloud.points, encoding, batch_size=7)
+    np.testing.assert_array_equal(chunked, point_regions(small_model, cloud.points, encoding))
+
+
+def test_point_regions_are_those_that_the_network_used(small_model, pair):
+    cloud = make_cloud(pair[0])
+    encoding = encode(small_model, cloud)
+    np.testing.assert_array_equal(point_regions(small_model, cloud.points, encoding), encoding.regions.labels)
+
+
+def _labelled(seed: int = 0):
+    rng = np.random.default_rng(seed)
+    features, labels = rng.normal(size=(50, 6)).astype(np.float32), rng.integers(0, 4, 50)
+    labels[labels == 2] = 4  # region 2 stays empty, label 4 is dropped
+    return features, labels
+
+
+def test_pool_by_label_agrees_with_numpy():
+    features, labels = _labelled()
+    pooled = pool_by_label(jnp.asarray(features), jnp.asarray(labels), jnp.arange(5))
+    for k in (0, 1, 3):
+        np.testing.assert_array_equal(pooled[k], features[labels == k].max(axis=0))
+    assert bool(jnp.all(pooled[2] == -jnp.inf))
+
+
+def test_pool_by_label_gradient_goes_to_the_first_maximum():
+    features, labels = _labelled()
+    features[labels == 1, 0] = 9.0  # ties
+    weights = np.arange(1.0, 25.0).reshape(4, 6)
+
+    def total(values):
+        pooled = pool_by_label(values, jnp.asarray(labels), jnp.arange(5))
+        return jnp.sum(jnp.where(jnp.isfinite(pooled), pooled, 0.0) * weights)
+
+    expected = np.zeros_like(features)
+    for k in (0, 1, 3):
+        rows = np.flatnonzero(labels == k)
+        for c in range(6):
+            expected[rows[np.argmax(features[rows, c])], c] += weights[k, c]
+    np.testing.assert_allclose(jax.jit(jax.grad(total))(jnp.asarray(features)), expected)
+
+
+def test_split_regions_agrees_with_numpy(cloud):
+    mask = np.arange(200) % 4 != 0
+    rng = np.random.default_rng(0)
+    features, labels = rng.normal(size=(200, 5)).astype(np.float32), rng.integers(0, 3, 200)
+    regions = split_regions(make_cloud(cloud, mask), jnp.asarray(features), jnp.asarray(labels), 4)
+    for k in range(3):
+        mine = mask & (labels == k)
+        assert float(regions.counts[k]) == mine.sum()
+        np.testing.assert_allclose(regions.centroids[k], cloud[mine].mean(0), atol=1e-5)
+        np.testing.assert_array_equal(regions.features[k], features[mine].max(0))
+
+
+def test_shape_embedding_of_an_empty_cloud_is_zero():
+    np.testing.assert_array_equal(shape_embedding(jnp.ones((5, 3)), jnp.zeros(5, bool)), 0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"variant": "D"}, "^variant: .*'D'"),
+        ({"regions": 0}, "^regions: .*0"),
+        ({"width": -1}, "^width: .*-1"),
+        ({"steps": 0}, "^steps: .*0"),
+        ({"points": 2}, "^points: .*2"),
+        ({"attention_layers": -1}, "^attention_layers: .*-1"),
+        ({"decoder_widths": (8, 0)}, "^decoder_widths: .*0"),
+    ],
+)
+def test_config_refuses_and_names_the_field(fields, says):
+    with pytest.raises(ValueError, match=says):
+        ModelConfig(**fields)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"regions": 1},
+        {"attention_layers": 0},
+        {"variant": "B", "attention_layers": 0},
+        {"encoder_widths": ()},
+        {"decoder_widths": ()},
+        {"position_widths": ()},
+    ],
+)
+def test_smallest_networks_work(small_config, pair, fields):
+    model = _init(jax.random.key(0), dataclasses.replace(small_config, **fields))
+    _is_rotation(_predict(model, *map(make_cloud, pair)).rotation)

@@ -1,0 +1,283 @@
+"""The command line: what it prints, writes and answers to mistakes. Training and evaluation run on a toy scale."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import urrt_jax
+from urrt_jax import cli, io
+from urrt_jax.cli.demo import demo_pair
+from urrt_jax.cli.printing import as_table
+from urrt_jax.cli.train import NetworkFlags, PairFlags, Train
+from urrt_jax.data import demo_shape
+from urrt_jax.model import ModelConfig
+from urrt_jax.training.loop import LoopConfig
+from urrt_jax.training.pairs import PairConfig
+from urrt_jax.training.state import TrainConfig
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch):
+    """No cache folder, no debugging, no data of the developer's."""
+    monkeypatch.setenv("URRT_NO_CACHE", "1")
+    for name in ("URRT_DEBUG", "URRT_DATA"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, small_model) -> dict[str, Path]:
+    """Two clouds of 200 points and a small untrained model: enough for everything that is not about accuracy."""
+    folder = tmp_path_factory.mktemp("files")
+    shape = demo_shape(400).astype(np.float64)
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    io.write_cloud(folder / "a.ply", shape[::2])
+    io.write_cloud(folder / "b.xyz", shape[1::2] @ turn.T + [0.1, 0.2, 0.3])
+    urrt_jax.save_model(small_model, folder / "model.npz")
+    return {name: folder / name for name in ("a.ply", "b.xyz", "model.npz")}
+
+
+def register(files: dict[str, Path], *flags: str, source: Path | None = None, target: Path | None = None) -> int:
+    clouds = [str(source or files["a.ply"]), str(target or files["b.xyz"])]
+    return cli.main(["register", *clouds, "--model", str(files["model.npz"]), *flags])
+
+
+@pytest.mark.parametrize(
+    "command", [[], ["register"], ["demo"], ["train"], ["evaluate"]], ids=lambda c: "".join(c) or "urrt"
+)
+def test_help_answers_without_importing_jax(command):
+    program = (
+        "import sys\n"
+        "from urrt_jax.cli import main\n"
+        "try:\n"
+        f"    main({[*command, '--help']})\n"
+        "except SystemExit as end:\n"
+        "    assert not end.code\n"
+        "assert not {'jax', 'flax', 'numpy', 'matplotlib', 'trimesh'} & set(sys.modules), 'a heavy import'\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "usage: urrt" in done.stdout
+
+
+def test_json_is_one_object_with_exactly_the_promised_keys(files, capsys):
+    assert register(files, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["matrix", "rotation", "translation", "fitness", "rmse", "converged"]
+    matrix = np.array(found["matrix"])
+    np.testing.assert_array_equal(matrix[:3, :3], found["rotation"])
+    np.testing.assert_array_equal(matrix[:3, 3], found["translation"])
+    np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+    assert isinstance(found["fitness"], float) and isinstance(found["rmse"], float)
+    assert isinstance(found["converged"], bool)
+
+
+def test_table_shows_the_transform_and_the_diagnostics(files, capsys):
+    assert register(files) == 0
+    out = capsys.readouterr().out
+    for word in ("a.ply, 200 points", "b.xyz, 200 points", "R, turns by", "fitness", "rmse", "converged"):
+        assert word in out
+
+
+def test_a_failure_is_said_plainly(files):
+    clouds = (io.read_cloud(files[name]) for name in ("a.ply", "b.xyz"))
+    result = urrt_jax.register(*clouds, model=urrt_jax.load_model(files["model.npz"]))
+    assert "do not rely on this transform" in as_table(dataclasses.replace(result, converged=np.array(False)))
+    assert "do not rely" not in as_table(dataclasses.replace(result, converged=np.array(True)))
+
+
+@pytest.mark.parametrize("extension", ["ply", "xyz", "npy"])
+def test_out_holds_the_moved_source(files, capsys, tmp_path, extension):
+    assert register(files, "--json", "--out", str(tmp_path / f"moved.{extension}")) == 0
+    matrix = np.array(json.loads(capsys.readouterr().out)["matrix"])
+    expected = io.read_cloud(files["a.ply"]) @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(io.read_cloud(tmp_path / f"moved.{extension}"), expected, atol=1e-12)
+
+
+def test_out_as_ply_is_coloured(files, capsys, tmp_path):
+    assert register(files, "--out", str(tmp_path / "moved.ply")) == 0
+    assert b"property uchar red" in (tmp_path / "moved.ply").read_bytes()
+
+
+def test_map_coordinates_cost_no_digits(files, capsys, tmp_path):
+    origins = np.array([5e5, 4e6, 100.0]), np.array([4e5, 5e6, -200.0])
+    moved = []
+    for offsets in ((0, 0), origins):
+        for name, file, offset in zip(("a", "b"), ("a.ply", "b.xyz"), offsets, strict=True):
+            io.write_cloud(tmp_path / f"{name}.ply", io.read_cloud(files[file]) + offset)
+        out = tmp_path / "moved.ply"
+        assert register(files, "--out", str(out), source=tmp_path / "a.ply", target=tmp_path / "b.ply") == 0
+        moved.append(io.read_cloud(out) - offsets[1])
+    np.testing.assert_allclose(moved[1], moved[0], atol=1e-5)
+
+
+def test_no_refine_gives_the_networks_own_estimate(files, capsys):
+    assert register(files, "--no-refine", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    clouds = [io.read_cloud(files[name]) for name in ("a.ply", "b.xyz")]
+    expected = urrt_jax.register(*clouds, model=urrt_jax.load_model(files["model.npz"]), refine=None)
+    np.testing.assert_allclose(found["rotation"], expected.coarse.rotation, atol=1e-5)
+
+
+def test_picture_is_a_png(files, capsys, tmp_path):
+    assert register(files, "--picture", str(tmp_path / "pair.png")) == 0
+    assert (tmp_path / "pair.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("change", "flags"),
+    [
+        ({"source": Path("missing.ply")}, []),
+        ({}, ["--model", "no-such-model"]),
+        ({}, ["--out", "moved.docx"]),
+        ({}, ["--inlier-distance", "-1"]),
+        ({}, ["--out", "no-such-folder/moved.ply"]),
+    ],
+    ids=["missing file", "unknown model", "unknown extension", "negative distance", "missing folder"],
+)
+def test_a_mistake_is_one_line_on_stderr(files, capsys, tmp_path, monkeypatch, change, flags):
+    monkeypatch.chdir(tmp_path)
+    assert register(files, "--json", *flags, **change) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("urrt: error: ") and captured.err.count("\n") == 1
+
+
+def test_debugging_shows_the_traceback(files, monkeypatch):
+    monkeypatch.setenv("URRT_DEBUG", "1")
+    with pytest.raises(FileNotFoundError):
+        register(files, source=Path("missing.ply"))
+
+
+def test_an_unknown_flag_ends_with_code_2(files, capsys):
+    with pytest.raises(SystemExit) as end:
+        register(files, "--nonsense")
+    assert end.value.code == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_compiled_programs_are_kept_and_the_second_run_is_silent_about_it(files, tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "URRT_NO_CACHE"}
+    environment |= {"XDG_CACHE_HOME": str(tmp_path)}
+    program = [sys.executable, "-m", "urrt_jax.cli", "register", "--json", "--no-refine"]
+    command = [*program, str(files["a.ply"]), str(files["b.xyz"]), "--model", str(files["model.npz"])]
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)
+    )
+    assert any(path.is_file() for path in (tmp_path / "urrt_jax").rglob("*"))
+    assert json.loads(first.stdout) == json.loads(second.stdout)
+    assert first.stderr == second.stderr == ""
+
+
+def test_an_unusable_cache_folder_does_not_matter(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.delenv("URRT_NO_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    before = jax.config.jax_compilation_cache_dir
+    cli._keep_compiled_programs()
+    assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_demo_writes_its_picture_and_says_where(files, capsys, tmp_path):
+    out = tmp_path / "demo.png"
+    assert cli.main(["demo", "--model", str(files["model.npz"]), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert "against the truth" in printed and str(out) in printed
+
+
+def test_demo_pair_without_noise_and_cut_is_aligned_by_its_truth():
+    source, target, rotation, translation = demo_pair(1, noise=0.0, keep=1.0)
+    assert len(source) == len(target)
+    moved = source @ rotation.T + translation
+    gaps = np.linalg.norm(moved[:200, None] - target[None], axis=-1).min(axis=1)
+    assert np.median(gaps) < 0.05
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_demo_pair_keeps_the_share_asked_for():
+    assert len(demo_pair(0, noise=0.0, keep=0.5)[0]) == pytest.approx(1024, abs=2)
+
+
+@pytest.mark.parametrize("flags", [{"keep": 0.0}, {"keep": 1.1}, {"noise": -1.0}], ids=str)
+def test_demo_pair_refuses_nonsense(flags):
+    with pytest.raises(ValueError, match="expected"):
+        demo_pair(0, **({"noise": 0.0, "keep": 1.0} | flags))
+
+
+@pytest.mark.parametrize(
+    ("flags", "config"),
+    [(NetworkFlags(), ModelConfig()), (PairFlags(), PairConfig()), (Train(out=Path("x")), TrainConfig())],
+    ids=["model", "pairs", "train"],
+)
+def test_flags_of_train_have_the_librarys_defaults(flags, config):
+    mirrored = {field.name for field in dataclasses.fields(config)} & vars(flags).keys() - {"model", "pairs"}
+    assert len(mirrored) >= 6
+    assert {name: getattr(flags, name) for name in mirrored} == {name: getattr(config, name) for name in mirrored}
+
+
+def test_watching_flags_of_train_have_the_librarys_defaults():
+    flags, loop = Train(out=Path("x")), LoopConfig()
+    for name in ("every", "log_every", "validation_pairs", "patience"):
+        assert getattr(flags, name) == getattr(loop, name)
+
+
+def test_default_flags_make_the_default_configuration():
+    assert Train(out=Path("x")).config() == TrainConfig()
+
+
+def test_command_of_train_names_no_path():
+    flags = Train(out=Path("/somewhere/runs/one"), data="/somewhere/shapes.npz", steps=7, pairs=PairFlags(noise=0.1))
+    assert flags.command() == "urrt train --out one --data shapes.npz --steps 7 --pairs.noise 0.1"
+
+
+def test_train_writes_the_model_with_its_card(files, capsys, tmp_path, monkeypatch):
+    def fake_train(config, shapes, validation, directory, *, loop):
+        assert (config.steps, config.pairs.points, loop.every) == (20, 64, 10)
+        directory.mkdir()
+        validations = [
+            {"kind": "validation", "step": step, "validation_loss": loss} for step, loss in ((10, 0.1), (20, 0.2))
+        ]
+        lines = [{"kind": "train", "step": 5, "loss": 0.3}, *validations]
+        (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return urrt_jax.load_model(files["model.npz"])
+
+    monkeypatch.setattr("urrt_jax.training.loop.train", fake_train)
+    flags = "--limit 6 --validation-share 0.3 --steps 20 --loss-points 32 --every 10 --pairs.points 64"
+    assert cli.main(["train", "--out", str(tmp_path / "run"), *flags.split()]) == 0
+    assert urrt_jax.load_model(tmp_path / "run" / "model.npz").config.width == 16
+    card = urrt_jax.model_card(tmp_path / "run" / "model.npz")
+    assert card["command"] == f"urrt train --out run {flags}"
+    assert (card["data"], card["shapes"], card["validation_shapes"], card["steps"]) == ("procedural", 4, 2, 20)
+    assert card["validation"] == {"step": 10, "validation_loss": 0.1}
+    assert card["versions"]["urrt_jax"] == urrt_jax.__version__
+    assert str(tmp_path) not in json.dumps(card)
+
+
+def test_interrupted_training_says_how_to_continue(capsys, tmp_path, monkeypatch):
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("urrt_jax.training.loop.train", interrupt)
+    assert cli.main(["train", "--out", str(tmp_path), "--limit", "4"]) == 130
+    assert "the same command continues" in capsys.readouterr().err
+
+
+def test_evaluate_prints_a_table_and_writes_json(files, capsys, tmp_path):
+    flags = ["--model", str(files["model.npz"]), "--limit", "3", "--points", "100", "--batch", "2"]
+    assert cli.main(["evaluate", *flags, "--out", str(tmp_path / "results.json")]) == 0
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert (results["data"], results["model"], results["items"]) == ("procedural", "model.npz", 3)
+    out = capsys.readouterr().out
+    assert "mae_rotation" in out and "results.json" in out
+
+
+def test_evaluate_refuses_an_unknown_protocol(files, capsys):
+    assert cli.main(["evaluate", "--protocol", "guess", "--model", str(files["model.npz"])]) == 2
+    assert "protocol: expected one of" in capsys.readouterr().err

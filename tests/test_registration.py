@@ -1,0 +1,516 @@
+"""The one call: what it recovers, what it is invariant to, how it says that it failed."""
+
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from urrt_jax import ICP, Model, pad_clouds, register
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax.refine import icp
+from urrt_jax.registration import Registration
+
+
+def _angle(first, second) -> float:
+    turn = np.asarray(first, np.float64).T @ np.asarray(second, np.float64)
+    return float(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
+
+
+def _finite(result: Registration) -> bool:
+    return all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(result))
+
+
+@pytest.fixture(scope="module")
+def call(small_model):
+    """``register`` with the small model."""
+
+    def register_small(source, target, **options):
+        return register(source, target, **({"model": small_model} | options))
+
+    return register_small
+
+
+@pytest.fixture(scope="module")
+def target(cloud, pose) -> np.ndarray:
+    return (cloud @ pose[0].T + pose[1]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def plain(call, cloud, target) -> Registration:
+    return call(cloud, target)
+
+
+def _same(result, expected, *, atol=1e-4, scale=1.0):
+    assert _angle(result.rotation, expected.rotation) < atol
+    np.testing.assert_allclose(np.asarray(result.translation) / scale, expected.translation, atol=atol)
+
+
+def test_recovers_a_pose_of_ten_degrees(plain, pose):
+    assert _angle(plain.rotation, pose[0]) < 1e-3
+    np.testing.assert_allclose(plain.translation, pose[1], atol=1e-3)
+
+
+def test_clean_pair_converges_with_full_fitness(plain):
+    assert bool(plain.converged)
+    assert float(plain.fitness) == 1
+    assert float(plain.rmse) < 1e-3
+
+
+def test_network_alone_is_not_the_answer(plain, pose):
+    """Otherwise the tests of refinement here would test nothing."""
+    assert _angle(plain.coarse.rotation, pose[0]) > 0.02
+
+
+def test_without_refinement_the_answer_is_the_network_s(call, cloud, target, plain):
+    alone = call(cloud, target, refine=None)
+    np.testing.assert_allclose(alone.rotation, plain.coarse.rotation, atol=1e-6)
+    np.testing.assert_allclose(alone.translation, plain.coarse.translation, atol=1e-6)
+    assert int(alone.steps) == 0
+
+
+@pytest.mark.parametrize("options", [ICP(coarse_points=0), ICP(points=50), ICP(coarse_points=32)])
+def test_other_ways_to_refine_find_the_same_pose(call, cloud, pose, options):
+    small = Rotation.from_rotvec([0, 0, 0.02]).as_matrix()
+    moved = (cloud @ small.T + 0.005).astype(np.float32)
+    start = rigid.identity()
+    found = icp(make_cloud(cloud), make_cloud(moved), start, options).transform
+    assert _angle(found.rotation, small) < 1e-3
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_order_of_points_does_not_matter(call, cloud, target, plain, which):
+    clouds = [cloud, target]
+    clouds[which] = np.random.default_rng(0).permutation(clouds[which])
+    _same(call(*clouds), plain)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_moving_a_cloud_moves_the_answer(call, cloud, target, plain, which):
+    clouds, offset = [cloud, target], np.array([1000.0, -300, 500], np.float32)
+    clouds[which] = clouds[which] + offset
+    result = call(*clouds)
+    # Coordinates near 1000 are rounded to 6e-5 before anything here sees them.
+    assert _angle(result.rotation, plain.rotation) < 1e-3
+    expected = plain.translation + (offset if which else -plain.rotation @ offset)
+    np.testing.assert_allclose(result.translation, expected, atol=0.3)
+    np.testing.assert_allclose(result.apply(clouds[0].mean(0)), clouds[1].mean(0), atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3, 1e6])
+def test_common_scale_scales_the_answer(call, cloud, target, plain, scale):
+    result = call(cloud * np.float32(scale), target * np.float32(scale))
+    _same(result, plain, scale=scale)
+    for name in ("rmse", "inlier_distance"):
+        assert float(getattr(result, name)) / scale == pytest.approx(float(getattr(plain, name)), rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-25, 1e20, 1e30])
+def test_extreme_scale_is_finite_or_flagged(call, cloud, target, scale):
+    result = call(cloud * np.float32(scale), target * np.float32(scale))
+    assert _finite(result) or not bool(result.converged)
+    assert bool(jnp.all(jnp.isfinite(result.rotation)))
+
+
+def test_map_coordinates_in_float64_keep_the_rotation(call, cloud, pose):
+    origin = np.array([5e6, 4e5, 300.0])
+    source = cloud.astype(np.float64) + origin
+    moved = cloud.astype(np.float64) @ pose[0].T + pose[1] + origin
+    result = call(source, moved)
+    assert _angle(result.rotation, pose[0]) < 1e-3
+    assert bool(result.converged)
+
+
+def test_map_coordinates_in_float64_carry_the_origin_in_the_translation(call, cloud, pose):
+    origin = np.array([1000.0, -2000, 500])
+    result = call(cloud.astype(np.float64) + origin, cloud.astype(np.float64) @ pose[0].T + pose[1])
+    expected = pose[1] - np.asarray(result.rotation, np.float64) @ origin
+    np.testing.assert_allclose(result.translation, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "convert",
+    [
+        pytest.param(lambda p: p.tolist(), id="lists"),
+        pytest.param(lambda p: p.astype(np.float64), id="float64"),
+        pytest.param(lambda p: jnp.asarray(p), id="jax"),
+        pytest.param(lambda p: p.astype(np.float16), id="float16"),
+        pytest.param(lambda p: jnp.asarray(p, jnp.float16), id="jax float16"),
+        pytest.param(lambda p: jnp.asarray(p, jnp.bfloat16), id="jax bfloat16"),
+        pytest.param(lambda p: np.round(p * 1e4).astype(np.int32), id="integers"),
+        pytest.param(lambda p: jnp.asarray(np.round(p * 1e4), jnp.int32), id="jax integers"),
+        pytest.param(lambda p: np.asfortranarray(p), id="column order"),
+        pytest.param(lambda p: np.concatenate([p, p], 1)[:, :3], id="strided view"),
+    ],
+)
+def test_every_real_dtype_gives_the_rotation_in_float32(call, cloud, target, pose, convert):
+    result = call(convert(cloud), convert(target))
+    assert result.rotation.dtype == jnp.float32
+    assert _angle(result.rotation, pose[0]) < 0.02
+
+
+@pytest.mark.parametrize("which", ["source", "target"])
+def test_padding_changes_nothing(call, cloud, target, plain, which):
+    clouds = {"source": cloud, "target": target}
+    padded = np.concatenate([clouds[which], np.full((23, 3), 1e4, np.float32)])
+    result = call(**(clouds | {which: padded, f"{which}_mask": np.arange(223) < 200}))
+    _same(result, plain)
+    assert float(result.fitness) == pytest.approx(float(plain.fitness))
+
+
+def test_padding_may_be_nan(call, cloud, target, plain):
+    padded = np.concatenate([cloud, np.full((23, 3), np.nan, np.float32)])
+    _same(call(padded, target, source_mask=np.arange(223) < 200), plain)
+
+
+def test_padding_of_float64_clouds_may_be_anything(call, cloud, target, plain):
+    padded = np.concatenate([cloud.astype(np.float64), np.full((23, 3), 1e12)])
+    _same(call(padded, target, source_mask=np.arange(223) < 200), plain)
+
+
+def test_regions_have_one_label_a_point_and_zero_at_padding(call, cloud, target):
+    padded = np.concatenate([cloud, np.ones((23, 3), np.float32)])
+    result = call(padded, target, source_mask=np.arange(223) < 200)
+    assert result.source_regions.shape == (223,)
+    assert result.target_regions.shape == (200,)
+    np.testing.assert_array_equal(result.source_regions[200:], 0)
+    for labels in (result.source_regions, result.target_regions):
+        assert 0 <= int(labels.min()) <= int(labels.max()) < 4
+
+
+def test_several_regions_are_in_use(plain):
+    """Otherwise zero at padding would say nothing."""
+    assert len(np.unique(plain.source_regions)) > 1
+
+
+def test_jit_agrees_with_eager(small_model, cloud, target, plain):
+    _same(jax.jit(lambda s, t: register(s, t, model=small_model))(cloud, target), plain, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def batch(cloud, target, make_cloud_points):
+    other = make_cloud_points(7)
+    turn = Rotation.from_rotvec([0.1, -0.05, 0.1]).as_matrix()
+    return np.stack([cloud, other]), np.stack([target, (other @ turn.T).astype(np.float32)])
+
+
+@pytest.fixture(scope="module")
+def together(batch, small_model):
+    return jax.vmap(lambda s, t: register(s, t, model=small_model))(*batch)
+
+
+def test_vmap_agrees_with_a_loop(call, batch, together):
+    for i in range(2):
+        _same(jax.tree.map(lambda leaf, i=i: leaf[i], together), call(batch[0][i], batch[1][i]))
+
+
+def test_batched_matrix_is_one_matrix_a_pair(together):
+    matrix = np.asarray(together.matrix)
+    assert matrix.shape == (2, 4, 4)
+    np.testing.assert_array_equal(matrix[:, :3, :3], together.rotation)
+    np.testing.assert_array_equal(matrix[:, :3, 3], together.translation)
+    np.testing.assert_array_equal(matrix[:, 3], [[0, 0, 0, 1]] * 2)
+
+
+def test_batched_apply_moves_every_cloud_by_its_own_transform(batch, together):
+    moved = together.apply(batch[0])
+    for i in range(2):
+        expected = batch[0][i] @ np.asarray(together.rotation[i]).T + np.asarray(together.translation[i])
+        np.testing.assert_allclose(moved[i], expected, atol=1e-5)
+
+
+def test_batched_apply_of_three_pairs_is_not_mixed_up(cloud, pose, plain):
+    """Three pairs make the batch as long as a rotation, so that a wrong transpose fits."""
+    turns = np.stack([Rotation.from_rotvec([0.1 * i, 0.2, -0.3]).as_matrix() for i in range(3)]).astype(np.float32)
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), plain)
+    stacked = type(plain)(**{**vars(stacked), "rotation": jnp.asarray(turns), "translation": jnp.zeros((3, 3))})
+    moved = stacked.apply(np.stack([cloud] * 3))
+    np.testing.assert_allclose(moved, np.stack([cloud @ turn.T for turn in turns]), atol=1e-5)
+
+
+def test_batched_transform_agrees_with_the_batched_matrix(together):
+    np.testing.assert_allclose(together.transform.as_matrix()[:, :3, :3], together.rotation, atol=1e-5)
+
+
+def test_padded_batch_agrees_with_a_loop(call, small_model, cloud, target, plain):
+    points, mask = pad_clouds([cloud, cloud[:150]])
+    goals, goal_mask = pad_clouds([target, target])
+    results = jax.vmap(lambda s, t, m, k: register(s, t, source_mask=m, target_mask=k, model=small_model))(
+        points, goals, mask, goal_mask
+    )
+    _same(jax.tree.map(lambda leaf: leaf[0], results), plain)
+    _same(jax.tree.map(lambda leaf: leaf[1], results), call(cloud[:150], target))
+
+
+def test_matrix_transform_and_apply_agree(plain, cloud, target):
+    np.testing.assert_allclose(plain.apply(cloud), target, atol=2e-3)
+    homogeneous = np.concatenate([cloud, np.ones((200, 1), np.float32)], 1) @ np.asarray(plain.matrix).T
+    np.testing.assert_allclose(homogeneous[:, :3], plain.apply(cloud), atol=1e-5)
+    np.testing.assert_allclose(plain.transform.apply(jnp.asarray(cloud)), plain.apply(cloud), atol=1e-5)
+
+
+def test_swapping_the_clouds_gives_the_inverse(call, cloud, target, plain):
+    back = call(target, cloud)
+    np.testing.assert_allclose(back.matrix @ plain.matrix, np.eye(4), atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def apart(cloud) -> np.ndarray:
+    """Points of the cloud of which no two are close to each other."""
+    kept = cloud[:1]
+    for point in cloud[1:]:
+        if np.linalg.norm(kept - point, axis=1).min() > 0.15:
+            kept = np.concatenate([kept, point[None]])
+    return kept
+
+
+@pytest.mark.parametrize("part", ["rotation", "translation"])
+@pytest.mark.parametrize("moves", ["source", "target"])
+def test_refined_pose_derivative_agrees_with_finite_differences(small_model, apart, pose, part, moves):
+    """Noise on the target, so that the fit is not perfect; the points lie so far apart that correspondences hold."""
+    rng = np.random.default_rng(0)
+    noisy = apart @ pose[0].T + pose[1] + 0.004 * rng.normal(size=apart.shape)
+    points = {"source": jnp.asarray(apart), "target": jnp.asarray(noisy, jnp.float32)}
+    along = jnp.asarray(rng.normal(size=apart.shape), jnp.float32)
+    weights = jnp.asarray(rng.normal(size=(3, 3) if part == "rotation" else 3), jnp.float32)
+
+    @jax.jit
+    def value(step):
+        result = register(**(points | {moves: points[moves] + step * along}), model=small_model)
+        return jnp.sum(getattr(result, part) * weights)
+
+    step = 3e-3
+    difference = float(value(step) - value(-step)) / (2 * step)
+    assert float(jax.grad(value)(0.0)) == pytest.approx(difference, rel=0.05, abs=5e-3)
+
+
+def test_derivative_of_the_translation_follows_a_moved_cloud(small_model, cloud, target):
+    jacobian = jax.jacobian(
+        lambda offset: register(jnp.asarray(cloud), jnp.asarray(target) + offset, model=small_model).translation
+    )(jnp.zeros(3))
+    np.testing.assert_allclose(jacobian, np.eye(3), atol=1e-3)
+
+
+def test_network_alone_differentiates_in_the_parameters(small_model, cloud, target):
+    def total(params):
+        model = Model(small_model.config, params)
+        return jnp.sum(register(jnp.asarray(cloud), jnp.asarray(target), model=model, refine=None).rotation)
+
+    gradient = jax.grad(total)(small_model.params)
+    leaves = jax.tree.leaves(gradient["decoder"]) + jax.tree.leaves(gradient["encoder"])
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
+    assert any(bool(jnp.any(leaf)) for leaf in leaves)
+
+
+_SPHERE = np.random.default_rng(0).normal(size=(200, 3))
+_SPHERE = (_SPHERE / np.linalg.norm(_SPHERE, axis=1, keepdims=True)).astype(np.float32)
+_CUBE = np.stack(np.meshgrid(*[np.linspace(-1, 1, 6)] * 3), -1).reshape(-1, 3)
+_CUBE = _CUBE[np.abs(_CUBE).max(1) > 0.99].astype(np.float32)
+
+
+@pytest.mark.parametrize("refine", [None, ICP()], ids=["network", "icp"])
+@pytest.mark.parametrize("points", [_SPHERE, _CUBE, _CUBE * [1, 1, 0]], ids=["sphere", "cube", "square"])
+def test_gradient_is_finite_for_equal_symmetric_clouds(small_model, points, refine):
+    points = jnp.asarray(points, jnp.float32)
+
+    def total(source):
+        result = register(source, points, model=small_model, refine=refine)
+        return jnp.sum(result.rotation * jnp.arange(9.0).reshape(3, 3)) + jnp.sum(result.translation) + result.rmse
+
+    assert bool(jnp.all(jnp.isfinite(jax.jit(jax.grad(total))(points))))
+
+
+def test_cloud_onto_itself_stays(call, cloud):
+    result = call(cloud, cloud)
+    assert _angle(result.rotation, np.eye(3)) < 1e-3
+    np.testing.assert_allclose(result.translation, 0, atol=1e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_bad_points_under_jit_are_ignored(small_model, cloud, target, plain, bad):
+    spoilt = cloud.copy()
+    spoilt[[3, 50], [0, 2]] = bad
+    result = jax.jit(lambda s, t: register(s, t, model=small_model))(spoilt, target)
+    assert _finite(result)
+    assert _angle(result.rotation, plain.rotation) < 5e-3
+
+
+@pytest.mark.parametrize("which", ["source", "target"])
+def test_cloud_of_nan_under_jit_is_finite_and_flagged(small_model, cloud, target, which):
+    clouds = {"source": cloud, "target": target}
+    clouds[which] = np.full((200, 3), np.nan, np.float32)
+    result = jax.jit(lambda c: register(**c, model=small_model))(clouds)
+    assert _finite(result)
+    assert not bool(result.converged)
+
+
+def test_masked_out_cloud_under_jit_is_finite_and_flagged(small_model, cloud, target):
+    result = jax.jit(lambda m: register(cloud, target, source_mask=m, model=small_model))(np.zeros(200, bool))
+    assert _finite(result)
+    assert not bool(result.converged)
+
+
+@pytest.mark.parametrize("which", ["source", "target", "both"])
+def test_collinear_clouds_along_an_axis_are_flagged(call, cloud, which):
+    line = np.zeros((200, 3), np.float32)
+    line[:, 0] = np.linspace(-1, 1, 200)
+    result = call(cloud if which == "target" else line, cloud if which == "source" else line)
+    assert _finite(result)
+    assert not bool(result.converged)
+
+
+def test_collinear_clouds_in_any_direction_are_flagged(small_model):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    lines = (np.linspace(-1, 1, 50)[None, :, None] * directions[:, None]).astype(np.float32)
+    results = jax.jit(jax.vmap(lambda line: register(line, line, model=small_model)))(lines)
+    assert int(jnp.sum(results.converged)) == 0
+
+
+def test_planar_clouds_are_not_flagged(call, cloud):
+    flat = cloud * np.array([1, 1, 0], np.float32)
+    turn = Rotation.from_rotvec([0.05, 0.02, 0.1]).as_matrix()
+    result = call(flat, (flat @ turn.T).astype(np.float32))
+    assert bool(result.converged)
+
+
+def test_unrelated_clouds_are_not_called_converged(call):
+    rng = np.random.default_rng(0)
+    dense_line = np.outer(np.linspace(-1, 1, 200), [1, 0, 0]) + 0.001 * rng.normal(size=(200, 3))
+    ring = np.stack([np.cos(np.arange(200)), np.sin(np.arange(200)), np.zeros(200)], 1)
+    result = call(dense_line.astype(np.float32), ring.astype(np.float32))
+    assert _finite(result)
+    assert float(result.fitness) < 0.3
+    assert not bool(result.converged)
+
+
+def test_cloud_of_two_far_blobs_is_registered(call, cloud, pose):
+    source = np.concatenate([cloud, 0.5 * cloud[:100] + np.float32(8)])
+    moved = (source @ pose[0].T + pose[1]).astype(np.float32)
+    result = call(source, moved)
+    assert _angle(result.rotation, pose[0]) < 1e-3
+    assert bool(result.converged)
+
+
+def test_every_point_given_twice_changes_nothing(call, cloud, target, pose):
+    """As the corners of a triangle soup are."""
+    result = call(np.repeat(cloud, 2, axis=0), np.repeat(target, 2, axis=0))
+    assert _angle(result.rotation, pose[0]) < 1e-3
+    assert bool(result.converged)
+
+
+def test_three_points_are_enough(call):
+    triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], np.float32)
+    result = call(triangle, triangle + 1)
+    assert _finite(result)
+
+
+@pytest.mark.parametrize("which", ["source", "target"])
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        pytest.param(np.zeros((5, 2)), r"\(5, 2\)", id="shape"),
+        pytest.param(np.zeros((0, 3)), "empty", id="empty"),
+        pytest.param(np.full((5, 3), np.nan), "15 NaN", id="nan"),
+        pytest.param(np.ones((5, 3)), "distinct points, got 1", id="one point"),
+        pytest.param(np.ones((5, 3), bool), "bool", id="dtype"),
+        pytest.param(np.array([[2**25, 0, 0], [1, 1, 1], [2, 2, 0]]), r"2\*\*24", id="large integers"),
+    ],
+)
+def test_bad_input_names_the_argument(call, cloud, which, points, says):
+    with pytest.raises(ValueError, match=rf"^{which}: .*{says}"):
+        call(**{"source": cloud, "target": cloud, which: points})
+
+
+@pytest.mark.parametrize("which", ["source_mask", "target_mask"])
+def test_mask_of_the_wrong_length_is_named(call, cloud, which):
+    with pytest.raises(ValueError, match=rf"^{which}: "):
+        call(cloud, cloud, **{which: np.ones(199, bool)})
+
+
+@pytest.mark.parametrize("distance", [0.0, -1.0, float("nan")])
+def test_inlier_distance_must_be_positive(call, cloud, distance):
+    with pytest.raises(ValueError, match=r"^inlier_distance: "):
+        call(cloud, cloud, inlier_distance=distance)
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"points": 2}, "^points: .*2"),
+        ({"iterations": 0}, "^iterations: .*0"),
+        ({"coarse_points": -1}, "^coarse_points: .*-1"),
+        ({"reach": 0.0}, "^reach: .*0.0"),
+        ({"tolerance": float("nan")}, "^tolerance: .*nan"),
+    ],
+)
+def test_icp_refuses_and_names_the_option(fields, says):
+    with pytest.raises(ValueError, match=says):
+        ICP(**fields)
+
+
+@pytest.mark.parametrize("inlier_distance", [0.01, 0.05, 0.2, 10.0])
+def test_fitness_and_rmse_agree_with_a_kd_tree_over_all_points(call, make_cloud_points, pose, inlier_distance):
+    source = make_cloud_points(1, 3)
+    noise = 0.02 * np.random.default_rng(2).normal(size=source.shape)
+    moved = (source @ pose[0].T + pose[1] + noise)[: len(source) // 2].astype(np.float32)
+    result = call(source, moved, inlier_distance=inlier_distance)
+    assert float(result.inlier_distance) == pytest.approx(inlier_distance, rel=1e-5)
+    distance = cKDTree(moved).query(np.asarray(result.apply(source)))[0]
+    inlier = distance <= inlier_distance
+    assert float(result.fitness) == pytest.approx(inlier.mean(), abs=2e-3)
+    assert float(result.rmse) == pytest.approx(np.sqrt(np.mean(distance[inlier] ** 2)), rel=1e-2, abs=1e-5)
+
+
+def test_default_inlier_distance_is_one_and_a_half_spacings(plain, cloud):
+    spacing = np.sqrt(np.mean(cKDTree(cloud).query(cloud, k=2)[0][:, 1] ** 2))
+    assert float(plain.inlier_distance) == pytest.approx(1.5 * spacing, rel=1e-3)
+
+
+def test_inlier_distance_may_be_traced(small_model, cloud, target):
+    result = jax.jit(lambda d: register(cloud, target, model=small_model, inlier_distance=d))(0.07)
+    assert float(result.inlier_distance) == pytest.approx(0.07, rel=1e-5)
+
+
+def test_same_input_gives_the_same_answer(call, cloud, target, plain):
+    again = call(cloud, target)
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+_LARGE = """
+    import resource, sys
+    import jax, jax.numpy as jnp, numpy as np
+    from urrt_jax import ModelConfig, register
+    from urrt_jax.model import init_model
+
+    model = init_model(jax.random.key(0), ModelConfig(
+        regions=4, width=16, encoder_widths=(16,), branch_width=8, position_widths=(8,), decoder_widths=(16,),
+        steps=1, points=64))
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200_000, 3))
+    points *= np.array([1.0, 0.7, 0.4]) / np.linalg.norm(points, axis=1, keepdims=True)
+    points[:60_000] = 0.3 * points[:60_000] + [0.8, 0.5, 0.2]
+    angle = 0.05
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    result = register(points.astype(np.float32), (points @ turn.T).astype(np.float32), model=model)
+    assert np.abs(np.asarray(result.rotation) - turn).max() < 1e-3, result.rotation
+    assert result.fitness > 0.99, result.fitness
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+def test_two_clouds_of_200_000_points_take_less_than_two_gibibytes():
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(_LARGE)], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert int(done.stdout) * 1024 < 2 * 2**30

@@ -1,0 +1,170 @@
+"""Checkpoints: whole ones only, the last and the best kept, one configuration a folder, any moment to be killed at."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from urrt_jax import ModelConfig
+from urrt_jax.training.checkpoints import Checkpoints
+from urrt_jax.training.pairs import PairConfig
+from urrt_jax.training.state import TrainConfig, TrainState, init_state
+
+_CONFIG = TrainConfig(
+    model=ModelConfig(
+        regions=2, width=4, encoder_widths=(4,), branch_width=4, position_widths=(4,), decoder_widths=(4,)
+    ),
+    pairs=PairConfig(points=16),
+    loss_points=16,
+    steps=10,
+)
+
+
+@pytest.fixture(scope="module")
+def state() -> TrainState:
+    return jax.jit(init_state, static_argnums=0)(_CONFIG)
+
+
+def _at(state: TrainState, step: int) -> TrainState:
+    """A state that tells which step it is from, in every leaf."""
+    params = jax.tree.map(lambda leaf: jnp.full_like(leaf, step), state.params)
+    return TrainState(jnp.asarray(step, jnp.int32), params, state.opt_state)
+
+
+def _assert_same(first, second):
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def _folders(directory) -> set[str]:
+    return {path.name for path in (directory / "checkpoints").iterdir() if path.is_dir()}
+
+
+def test_nothing_saved_restores_nothing(tmp_path, state):
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        assert checkpoints.restore_latest(state) is None
+        assert checkpoints.restore_best(state) is None
+
+
+def test_saved_state_comes_back_in_another_process_s_place(tmp_path, state):
+    saved = _at(state, 3)
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        checkpoints.save(saved, 0.5)
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        _assert_same(checkpoints.restore_latest(state), saved)
+
+
+def test_last_and_best_are_kept(tmp_path, state):
+    with Checkpoints(tmp_path, _CONFIG, keep=2) as checkpoints:
+        for step, loss in [(1, 0.5), (2, 0.1), (3, 0.4), (4, 0.3), (5, 0.2)]:
+            checkpoints.save(_at(state, step), loss)
+    with Checkpoints(tmp_path, _CONFIG, keep=2) as checkpoints:
+        assert int(checkpoints.restore_latest(state).step) == 5
+        assert int(checkpoints.restore_best(state).step) == 2
+    assert len(_folders(tmp_path)) == 3
+
+
+def test_best_among_losses_that_are_not_numbers_is_a_number(tmp_path, state):
+    with Checkpoints(tmp_path, _CONFIG, keep=1) as checkpoints:
+        for step, loss in [(1, float("nan")), (2, 0.1), (3, float("nan")), (4, 0.3)]:
+            checkpoints.save(_at(state, step), loss)
+        assert int(checkpoints.restore_best(state).step) == 2
+
+
+def test_without_validation_the_best_is_the_last(tmp_path, state):
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        checkpoints.save(_at(state, 1))
+        checkpoints.save(_at(state, 2))
+        assert int(checkpoints.restore_best(state).step) == 2
+
+
+def test_same_step_twice_is_saved_once(tmp_path, state):
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        checkpoints.save(_at(state, 1), 0.5)
+        checkpoints.save(_at(state, 1), 0.5)
+    assert len(_folders(tmp_path)) == 1
+
+
+def test_another_configuration_is_refused_and_the_fields_are_listed(tmp_path):
+    with Checkpoints(tmp_path, _CONFIG):
+        pass
+    other = dataclasses.replace(
+        _CONFIG, learning_rate=5e-4, model=dataclasses.replace(_CONFIG.model, regions=3), pairs=PairConfig(points=17)
+    )
+    with pytest.raises(ValueError, match="another configuration") as caught:
+        Checkpoints(tmp_path, other)
+    message = str(caught.value)
+    for said in ("learning_rate: 0.001 there, 0.0005 now", "model.regions: 2 there, 3 now", "pairs.points: 16 there"):
+        assert said in message
+    assert "model.width" not in message
+
+
+def test_the_configuration_lies_beside_the_checkpoints_as_json(tmp_path):
+    with Checkpoints(tmp_path, _CONFIG):
+        pass
+    assert json.loads((tmp_path / "config.json").read_text())["model"]["regions"] == 2
+
+
+def test_a_leftover_temporary_folder_does_not_count(tmp_path, state):
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        checkpoints.save(_at(state, 1), 0.5)
+    whole = _folders(tmp_path).pop()
+    leftover = tmp_path / "checkpoints" / f"{whole.replace('1', '7')}.orbax-checkpoint-tmp"
+    leftover.mkdir()
+    (leftover / "half").write_text("written")
+    with Checkpoints(tmp_path, _CONFIG) as checkpoints:
+        assert int(checkpoints.restore_latest(state).step) == 1
+
+
+# Saves 16 MB states without end; every leaf of a state holds its step number.
+_SAVER = """
+    import sys
+    import jax.numpy as jnp
+    from urrt_jax.training.checkpoints import Checkpoints
+    from urrt_jax.training.state import TrainConfig, TrainState
+
+    with Checkpoints(sys.argv[1], TrainConfig()) as checkpoints:
+        for step in range(1, 10_000):
+            leaf = jnp.full((1024, 1024), step, jnp.float32)
+            state = TrainState(jnp.asarray(step, jnp.int32), {"a": leaf, "b": leaf, "c": leaf}, (leaf,))
+            checkpoints.save(state, 1.0 / step)
+            print(step, flush=True)
+"""
+
+
+@pytest.mark.parametrize("wait", [0.0, 0.013, 0.05, 0.21])
+def test_a_save_killed_in_the_middle_leaves_whole_checkpoints_only(tmp_path, wait):
+    saver = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(_SAVER), str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        begun = 0
+        while begun < 3:
+            line = saver.stdout.readline()
+            assert line, "the saver ended by itself"
+            begun = int(line)
+        time.sleep(wait)
+    finally:
+        os.kill(saver.pid, signal.SIGKILL)
+        begun = max([begun, *map(int, saver.stdout.read().split())])
+        saver.wait()
+        saver.stdout.close()
+    leaf = jnp.zeros((1024, 1024))
+    like = TrainState(jnp.zeros((), jnp.int32), {"a": leaf, "b": leaf, "c": leaf}, (leaf,))
+    with Checkpoints(tmp_path, TrainConfig()) as checkpoints:
+        restored = checkpoints.restore_latest(like)
+        assert restored is not None
+        step = int(restored.step)
+        # Saves are one behind at most: the next one waits for the one before.
+        assert begun - 2 <= step <= begun
+        assert all(bool(jnp.all(leaf == step)) for leaf in jax.tree.leaves((restored.params, restored.opt_state)))
+        checkpoints.save(TrainState(jnp.asarray(step + 1, jnp.int32), restored.params, restored.opt_state), 0.0)
+    assert not [name for name in _folders(tmp_path) if "tmp" in name]

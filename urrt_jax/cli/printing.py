@@ -1,0 +1,39 @@
+"""How a registration is printed: for people and for programs."""
+
+from typing import Any
+
+import numpy as np
+
+from urrt_jax.evaluation.metrics import rotation_degrees
+from urrt_jax.registration import Registration
+
+
+def as_dict(result: Registration) -> dict[str, Any]:
+    """What ``--json`` prints."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = result.rotation, result.translation
+    return {
+        "matrix": matrix.tolist(),
+        "rotation": matrix[:3, :3].tolist(),
+        "translation": matrix[:3, 3].tolist(),
+        "fitness": float(result.fitness),
+        "rmse": float(result.rmse),
+        "converged": bool(result.converged),
+    }
+
+
+def as_table(result: Registration) -> str:
+    """The same for people."""
+    rotation, translation = np.asarray(result.rotation), np.asarray(result.translation)
+    heading = f"R, turns by {float(rotation_degrees(rotation, np.eye(3))):.2f}°"
+    lines = [f"{'':13}{heading:<36}t"]
+    for row, shift in zip(rotation, translation, strict=True):
+        lines.append(f"{'':11}" + "".join(f"{value:11.6f}" for value in row) + f"{shift:16.6f}")
+    reach = f"{float(result.inlier_distance):.4g}"
+    lines += [
+        "",
+        f"fitness      {float(result.fitness):<8.4f} share of the source within {reach} of the target",
+        f"rmse         {float(result.rmse):<8.4g} of those points",
+        "converged    yes" if result.converged else "converged    NO       do not rely on this transform",
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,207 @@
+"""``urrt train``: a model from shapes, without labels."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import sys
+import time
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from urrt_jax.training.state import TrainConfig
+
+# These mirror the library's configurations, with the same names and defaults (a test compares them): importing those
+# would import JAX, and --help would take seconds.
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkFlags:
+    """The network's shape.
+
+    Attributes:
+        variant: A: one decoder, no regions. B: regions, attention, one decoder a region. C: as B, and the attention
+            knows where the regions are.
+        regions: Regions that the network cuts a cloud into.
+        width: Dimension of the embeddings.
+        attention_layers: Self-attention layers over the regions.
+        steps: How often the network is applied, each time to the source as moved so far.
+        points: Points of a cloud that the network looks at.
+    """
+
+    variant: Literal["A", "B", "C"] = "C"
+    regions: int = 8
+    width: int = 128
+    attention_layers: int = 1
+    steps: int = 3
+    points: int = 512
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairFlags:
+    """How the training pairs are drawn and spoiled; the shapes have radius 1.
+
+    Attributes:
+        points: Points drawn of a shape.
+        max_angle: Largest rotation about each axis, in degrees.
+        signed: Share of pairs whose angles take random signs; the others turn one way only, as in DCP's protocol.
+        translation: Largest translation along each axis.
+        clean_share: First share of the steps in which all pairs are clean; that learns faster.
+        ramp_share: Share of the steps in which spoiled pairs come in.
+        corrupted: Share of pairs that are spoiled after that.
+        noise: Largest standard deviation of the noise on every coordinate.
+        keep: Smallest share of a cloud that a crop leaves.
+        outliers: Largest share of points replaced by stray ones.
+    """
+
+    points: int = 1024
+    max_angle: float = 45.0
+    signed: float = 0.5
+    translation: float = 0.5
+    clean_share: float = 0.3
+    ramp_share: float = 0.1
+    corrupted: float = 0.75
+    noise: float = 0.02
+    keep: float = 0.6
+    outliers: float = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a network on shapes, without labels. The same command continues a run that was stopped.
+
+    The folder gets config.json, metrics.jsonl, checkpoints/ and at the end model.npz with its card model.json:
+    'urrt register A B --model DIR/model.npz' uses it.
+
+    Attributes:
+        out: Folder of the run.
+        data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, else
+            'procedural'.
+        limit: At most so many shapes.
+        queries: Points a shape whose inside and outside teach the regions, where meshes are closed; 0 uses a shell
+            around the cloud instead.
+        validation_share: Share of the training shapes that is held out to choose the best checkpoint by.
+        steps: Optimiser steps.
+        batch: Pairs a step.
+        learning_rate: Its peak; it falls to a hundredth by the end.
+        warmup: Steps in which the learning rate rises.
+        occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
+        loss_points: Points of each cloud that the loss compares, at most --pairs.points.
+        steps_per_call: Steps in one dispatch; more of them help on an accelerator.
+        seed: Of the first weights and of every pair.
+        every: Steps between validations, each followed by a checkpoint.
+        log_every: Steps between lines of metrics.jsonl.
+        validation_pairs: Pairs of each kind in a validation.
+        patience: Validations without a better one after which training stops; 0: never.
+        model: The network.
+        pairs: The training pairs.
+    """
+
+    out: Path
+    data: str | None = None
+    limit: int | None = None
+    queries: int = 0
+    validation_share: float = 0.05
+    steps: int = 10_000
+    batch: int = 32
+    learning_rate: float = 1e-3
+    warmup: int = 200
+    occupancy_weight: float = 0.02
+    loss_points: int = 512
+    steps_per_call: int = 1
+    seed: int = 0
+    every: int = 500
+    log_every: int = 50
+    validation_pairs: int = 256
+    patience: int = 0
+    model: NetworkFlags = NetworkFlags()
+    pairs: PairFlags = PairFlags()
+
+    def config(self) -> TrainConfig:
+        """The library's configuration of this run."""
+        from urrt_jax.model import ModelConfig
+        from urrt_jax.training.pairs import PairConfig
+        from urrt_jax.training.state import TrainConfig
+
+        names = {field.name for field in fields(TrainConfig)} - {"model", "pairs"}
+        return TrainConfig(
+            model=ModelConfig(**asdict(self.model)),
+            pairs=PairConfig(**asdict(self.pairs)),
+            **{name: value for name, value in vars(self).items() if name in names},
+        )
+
+    def run(self) -> int:
+        """Trains, and writes the best model with its card."""
+        from importlib.metadata import version
+
+        import jax
+
+        from urrt_jax import __version__, save_model
+        from urrt_jax.data import find_data, load_shapes
+        from urrt_jax.training.loop import LoopConfig, train
+
+        config, source = self.config(), find_data(self.data)
+        loop = LoopConfig(
+            every=self.every,
+            log_every=self.log_every,
+            validation_pairs=self.validation_pairs,
+            patience=self.patience,
+        )
+        loaded = load_shapes(source, points=self.pairs.points, limit=self.limit, queries=self.queries, progress=True)
+        shapes, validation = loaded.split_validation(self.validation_share, self.seed)
+        print(f"{len(shapes)} shapes to train on, {len(validation)} held out; {len(loaded.skipped)} files skipped")
+        resumed, start = (self.out / "config.json").exists(), time.perf_counter()
+        try:
+            model = train(config, shapes, validation, self.out, loop=loop)
+        except KeyboardInterrupt:
+            print(f"urrt: stopped; the same command continues the run in {self.out}", file=sys.stderr)
+            return 130
+        path = save_model(
+            model,
+            self.out / "model.npz",
+            {
+                "command": self.command(),
+                "data": Path(source).name,
+                "shapes": len(shapes),
+                "validation_shapes": len(validation),
+                "steps": config.steps,
+                "seconds": round(time.perf_counter() - start, 1),
+                "resumed": resumed,  # then the seconds are those of the last part alone
+                "versions": {"urrt_jax": __version__} | {name: version(name) for name in ("jax", "flax", "optax")},
+                "processor": f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}",
+                "validation": best_validation(self.out / "metrics.jsonl"),
+                "log": validations(self.out / "metrics.jsonl"),
+            },
+        )
+        print(f"wrote {path}")
+        return 0
+
+    def command(self) -> str:
+        """The command line of this run, with names in the place of paths."""
+        return shlex.join(["urrt", "train", *_changed_flags(self)])
+
+
+def validations(log: Path) -> list[dict[str, Any]]:
+    """The validations in a run's metrics.jsonl, in their order."""
+    entries = [json.loads(line) for line in log.read_text().splitlines()]
+    return [entry for entry in entries if entry.pop("kind") == "validation"]
+
+
+def best_validation(log: Path) -> dict[str, Any]:
+    """The validation with the smallest loss; empty where there is none."""
+    return min(validations(log), key=lambda entry: entry["validation_loss"], default={})
+
+
+def _changed_flags(flags: Any, prefix: str = "") -> list[str]:
+    """The flags whose values are not the defaults, as they are typed."""
+    typed = []
+    for field in fields(flags):
+        value, name = getattr(flags, field.name), prefix + field.name.replace("_", "-")
+        if is_dataclass(value):
+            typed += _changed_flags(value, f"{name}.")
+        elif value != field.default:
+            typed += [f"--{name}", Path(value).name if name in ("out", "data") else str(value)]
+    return typed

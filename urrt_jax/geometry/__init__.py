@@ -1,0 +1,1 @@
+"""Point clouds with masks, rigid transforms and neighbour queries: the ground floor, which imports nothing above it."""

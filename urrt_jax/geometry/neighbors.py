@@ -1,0 +1,132 @@
+"""Nearest neighbours by direct differences: masked, chunked, differentiable in the distances.
+
+Squared distances are sums of squared differences, never |x|² + |y|² − 2xy: in float32 that form is wrong by 2 % for
+the smallest distances of a unit cloud and by a factor of five at an offset of 10.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from urrt_jax.geometry.clouds import Cloud
+
+_QUERY_CHUNK = 16_384
+
+
+class Neighbors(NamedTuple):
+    """For each query: the index of its neighbour in the reference, and the squared distance (inf if there is none)."""
+
+    index: Array
+    squared: Array
+
+
+def nearest(query: Array, reference: Cloud, *, distinct: bool = False, block: int | None = 16) -> Neighbors:
+    """The nearest real reference point of every query: index (N,) and squared distance (N,); ties go to the first.
+
+    The loop walks over the reference in blocks and keeps the best so far for all queries at once: XLA turns it into
+    vector instructions, and memory stays O(N). On a CPU this is over ten times faster than the minimum of a distance
+    matrix. Distances are differentiable in both clouds at fixed neighbours.
+
+    Args:
+      query: (N, 3).
+      reference: cloud of M points.
+      distinct: pass over reference points that coincide with the query.
+      block: reference points per step of the loop; None compares all at once, through an (N, M) matrix.
+    """
+    fixed = jax.lax.stop_gradient(query)
+    anchors = jax.lax.stop_gradient(jnp.where(reference.mask[:, None], reference.points, jnp.inf))
+    if block is None:
+        index, found = _nearest_dense(fixed, anchors, distinct)
+    elif query.shape[0] > 2 * _QUERY_CHUNK:
+
+        def one(point: Array) -> tuple[Array, Array]:
+            index, found = _nearest_scan(point[None], anchors, distinct, block)
+            return index[0], found[0]
+
+        index, found = jax.lax.map(one, fixed, batch_size=_QUERY_CHUNK)
+    else:
+        index, found = _nearest_scan(fixed, anchors, distinct, block)
+    squared = jnp.sum((query - reference.points[index]) ** 2, axis=-1)
+    return Neighbors(index, jnp.where(found, squared, jnp.inf))
+
+
+def _nearest_dense(query: Array, anchors: Array, distinct: bool) -> tuple[Array, Array]:
+    squared = sum((query[:, None, k] - anchors[None, :, k]) ** 2 for k in range(3))
+    if distinct:
+        squared = jnp.where(squared > 0, squared, jnp.inf)
+    smallest = jnp.min(squared, axis=1, keepdims=True)
+    # The first column equal to the minimum: a fraction of the time of XLA's argmin on a CPU.
+    index = jnp.min(jnp.where(squared == smallest, jnp.arange(anchors.shape[0]), anchors.shape[0] - 1), axis=1)
+    return index, jnp.isfinite(smallest[:, 0])
+
+
+def _nearest_scan(query: Array, anchors: Array, distinct: bool, block: int) -> tuple[Array, Array]:
+    count = anchors.shape[0]
+    block = min(block, count)
+    padding = -count % block
+    anchors = jnp.concatenate([anchors, jnp.full((padding, 3), jnp.inf, anchors.dtype)])
+    starts = jnp.arange(0, count + padding, block, dtype=jnp.int32)
+    x, y, z = query.T
+
+    def visit(best: tuple[Array, Array], step: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+        smallest, index = best
+        points, start = step
+        for j in range(block):
+            squared = (x - points[j, 0]) ** 2 + (y - points[j, 1]) ** 2 + (z - points[j, 2]) ** 2
+            closer = squared < smallest
+            if distinct:
+                closer &= squared > 0
+            smallest = jnp.where(closer, squared, smallest)
+            index = jnp.where(closer, start + j, index)
+        return (smallest, index), None
+
+    nothing = (jnp.full_like(x, jnp.inf), jnp.zeros(x.shape, jnp.int32))
+    (smallest, index), _ = jax.lax.scan(visit, nothing, (anchors.reshape(-1, block, 3), starts))
+    return index, jnp.isfinite(smallest)
+
+
+def k_nearest(query: Array, reference: Cloud, k: int, *, batch_size: int | None = 1024) -> Neighbors:
+    """The k nearest real reference points of every query, nearest first: index (N, k), squared distance (N, k).
+
+    Args:
+      query: (N, 3).
+      reference: cloud of M ≥ k points; where fewer than k are real, the rest has an infinite distance.
+      k: neighbours a query.
+      batch_size: queries handled at once, which bounds memory by batch_size · M; None for all.
+
+    Raises:
+      ValueError: k is not in 1..M.
+    """
+    if not 1 <= k <= reference.points.shape[0]:
+        raise ValueError(f"k: expected 1 to {reference.points.shape[0]}, got {k}")
+    anchors = jax.lax.stop_gradient(jnp.where(reference.mask[:, None], reference.points, jnp.inf))
+
+    def one(point: Array) -> Array:
+        squared = sum((point[i] - anchors[:, i]) ** 2 for i in range(3))
+        return jax.lax.top_k(-squared, k)[1]
+
+    fixed = jax.lax.stop_gradient(query)
+    if batch_size is None:
+        index = jax.vmap(one)(fixed)
+    else:
+        index = jax.lax.map(one, fixed, batch_size=min(batch_size, query.shape[0]))
+    squared = jnp.sum((query[:, None] - reference.points[index]) ** 2, axis=-1)
+    return Neighbors(index, jnp.where(reference.mask[index], squared, jnp.inf))
+
+
+def spacing(cloud: Cloud, *, sample: Cloud | None = None) -> Array:
+    """The root-mean-square distance from a real point to its nearest other point, (): the cloud's own resolution.
+
+    Points that coincide say nothing about it and are passed over; 0 for fewer than two distinct points.
+
+    Args:
+      cloud: N points.
+      sample: some of its points to ask at, when the cloud is large.
+    """
+    sample = cloud if sample is None else sample
+    squared = nearest(sample.points, cloud, distinct=True).squared
+    usable = sample.mask & jnp.isfinite(squared)
+    mean = jnp.sum(jnp.where(usable, squared, 0.0)) / jnp.maximum(jnp.sum(usable), 1)
+    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)

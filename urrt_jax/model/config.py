@@ -1,0 +1,75 @@
+"""The network's static configuration, validated when it is made."""
+
+import dataclasses
+import json
+from typing import Literal
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Everything that fixes the network's shape; hashable, static under jit, stored beside the weights.
+
+    Attributes:
+      variant: the paper's models. "A": one decoder conditioned on the shape embeddings, no regions. "B": regions,
+        attention and one decoder a region. "C": B with the position encoding of the regions' centroids.
+      regions: n, the number of regions (8 and 12 in BAE-NET).
+      width: d, the dimension of embeddings and region features.
+      encoder_widths: hidden widths of the point encoder, before its last layer of ``width``.
+      branch_width: hidden width of every region branch h_k.
+      position_widths: hidden widths of the position encoding δ.
+      attention_layers: self-attention layers over the regions.
+      decoder_widths: hidden widths of every decoder g_k.
+      steps: K, how often the network is applied, each time to the source moved by the estimate so far.
+      points: points of a cloud that the network looks at; larger clouds are subsampled (``subsample``).
+    """
+
+    variant: Literal["A", "B", "C"] = "C"
+    regions: int = 8
+    width: int = 128
+    encoder_widths: tuple[int, ...] = (64, 64, 128)
+    branch_width: int = 32
+    position_widths: tuple[int, ...] = (64,)
+    attention_layers: int = 1
+    decoder_widths: tuple[int, ...] = (128,)
+    steps: int = 3
+    points: int = 512
+
+    def __post_init__(self) -> None:
+        if self.variant not in ("A", "B", "C"):
+            raise ValueError(f"variant: expected 'A', 'B' or 'C', got {self.variant!r}")
+        for name in ("regions", "width", "branch_width", "steps", "points", "attention_layers"):
+            if not isinstance(getattr(self, name), int):
+                raise ValueError(f"{name}: expected an integer, got {getattr(self, name)!r}")
+        for name in ("regions", "width", "branch_width", "steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.points < 3:
+            raise ValueError(f"points: expected at least 3, got {self.points}")
+        if self.attention_layers < 0:
+            raise ValueError(f"attention_layers: expected at least 0, got {self.attention_layers}")
+        for name in ("encoder_widths", "position_widths", "decoder_widths"):
+            widths = getattr(self, name)
+            object.__setattr__(self, name, tuple(widths))
+            if any(not isinstance(width, int) or width < 1 for width in widths):
+                raise ValueError(f"{name}: expected positive integers, got {widths}")
+
+    @property
+    def has_regions(self) -> bool:
+        """Whether this is one of the paper's models with regions (B and C)."""
+        return self.variant != "A"
+
+    def to_json(self) -> str:
+        """The configuration as JSON."""
+        return json.dumps(dataclasses.asdict(self), indent=2)
+
+    @classmethod
+    def from_dict(cls, fields: dict) -> "ModelConfig":
+        """The configuration with these fields.
+
+        Raises:
+          ValueError: a field that this version does not know.
+        """
+        unknown = sorted(set(fields) - {field.name for field in dataclasses.fields(cls)})
+        if unknown:
+            raise ValueError(f"model configuration: unknown fields {unknown}")
+        return cls(**fields)

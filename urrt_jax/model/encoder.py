@@ -1,0 +1,32 @@
+"""Point encoder: an embedding for every point and, by max-pooling, one for the shape."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.model.blocks import Perceptron, run
+from urrt_jax.model.config import ModelConfig
+
+
+class PointEncoder(nn.Module):
+    """The embedding network of the paper's section 2.1, which it leaves unnamed; here PointNet's (Qi et al. 2017)."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, points: Array) -> Array:
+        """Point embeddings (N, d) of points (N, 3), each from its own coordinates."""
+        return Perceptron((*self.config.encoder_widths, self.config.width), normalize=True)(points)
+
+
+def shape_embedding(features: Array, mask: Array) -> Array:
+    """e: the maximum of the real points' embeddings, (d,), from (N, d) and (N,); zero for an empty cloud."""
+    pooled = jnp.max(jnp.where(mask[:, None], features, -jnp.inf), axis=0)
+    return jnp.where(jnp.any(mask), pooled, 0.0)
+
+
+def encode_points(config: ModelConfig, params: dict, cloud: Cloud) -> tuple[Array, Array]:
+    """Point embeddings (N, d) and the shape embedding e (d,) of a normalised cloud."""
+    features = run(PointEncoder(config), params, cloud.points)
+    return features, shape_embedding(features, cloud.mask)

@@ -1,0 +1,146 @@
+"""The whole network: from two normalised clouds to a transform, in K steps.
+
+Pure functions of a ``Model``, which is a pytree: static configuration and parameters. One pair at a time.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import Cloud, denormalize_translation, normalize_pair, subsample
+from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.model.attention import RegionTransformer, attend_regions
+from urrt_jax.model.config import ModelConfig
+from urrt_jax.model.decoder import decode, decoders, fuse, fusion_weights, to_rigid
+from urrt_jax.model.encoder import PointEncoder, encode_points
+from urrt_jax.model.partition import RegionBranches, Regions, branch_logits, region_labels, split_regions
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A network: its configuration, static under jit, and its parameters, a plain dictionary of arrays."""
+
+    config: ModelConfig = dataclasses.field(metadata={"static": True})
+    params: dict
+
+
+class Encoding(NamedTuple):
+    """What the network knows of one cloud in one pose.
+
+    Attributes:
+      embedding: (d,), the shape embedding e.
+      regions: the cloud's regions, with the attended features a; None for model A.
+    """
+
+    embedding: Array
+    regions: Regions | None
+
+
+class Estimate(NamedTuple):
+    """The network's answer for one pair, in the frame of its input.
+
+    Attributes:
+      transform: source to target, after the last step.
+      steps: the estimates after each step, stacked: rotation (K, 3, 3), translation (K, 3).
+      seen: the transform that the source had undergone when the last step saw it.
+      source: encoding of the source as the last step saw it.
+      target: encoding of the target.
+    """
+
+    transform: Rigid
+    steps: Rigid
+    seen: Rigid
+    source: Encoding
+    target: Encoding
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init_model(key: Array, config: ModelConfig) -> Model:
+    """A model with fresh parameters drawn from ``key``."""
+    keys = jax.random.split(key, 4)
+    n, d = config.regions, config.width
+    points, embedding = jnp.zeros((1, 3)), jnp.zeros(d)
+    params = {"encoder": PointEncoder(config).init(keys[0], points)["params"]}
+    if config.has_regions:
+        sequence = jnp.zeros((n, d)), jnp.zeros((n, 3)), jnp.ones(n, bool)
+        params["partition"] = RegionBranches(config).init(keys[1], points, embedding)["params"]
+        # Without attention layers and position encoding this stage learns nothing and has no parameters.
+        params["attention"] = RegionTransformer(config).init(keys[2], *sequence).get("params", {})
+    pair = jnp.zeros((n, 2 * d)) if config.has_regions else jnp.zeros(2 * d)
+    params["decoder"] = decoders(config).init(keys[3], pair)["params"]
+    return Model(config, params)
+
+
+def encode(model: Model, cloud: Cloud) -> Encoding:
+    """The encoding of one normalised cloud."""
+    config, params = model.config, model.params
+    features, embedding = encode_points(config, params["encoder"], cloud)
+    if not config.has_regions:
+        return Encoding(embedding, None)
+    logits = branch_logits(config, params["partition"], cloud.points, jax.lax.stop_gradient(embedding))
+    regions = split_regions(cloud, features, region_labels(logits), config.regions)
+    attended = attend_regions(config, params["attention"], regions)
+    return Encoding(embedding, regions._replace(features=attended))
+
+
+def match(model: Model, source: Encoding, target: Encoding) -> Rigid:
+    """The transform from source to target that one application of the decoders sees."""
+    config, params = model.config, model.params
+    if source.regions is None or target.regions is None:
+        return to_rigid(decode(config, params["decoder"], source.embedding, target.embedding))
+    codes = decode(config, params["decoder"], source.regions.features, target.regions.features)
+    return fuse(codes, fusion_weights(source.regions.counts, target.regions.counts))
+
+
+def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
+    """The transform from source to target, of two clouds normalised together (``normalize_pair``).
+
+    The network is applied ``config.steps`` times, each time to the source as moved so far; no derivative passes from
+    one step to the one before it. The target is encoded once. Labels of regions carry no derivative (hard arg-max).
+    """
+    target_encoding = encode(model, target)
+
+    def step(before: Rigid, _: None) -> tuple[Rigid, tuple[Rigid, Rigid, Encoding]]:
+        seen = jax.tree.map(jax.lax.stop_gradient, before)
+        moved = jnp.where(source.mask[:, None], rigid.apply(seen, source.points), 0.0)
+        encoding = encode(model, source._replace(points=moved))
+        after = rigid.compose(match(model, encoding, target_encoding), seen)
+        return after, (after, seen, encoding)
+
+    last, (steps, seen, encodings) = jax.lax.scan(step, rigid.identity(), None, length=model.config.steps)
+    final_seen, final_encoding = jax.tree.map(lambda values: values[-1], (seen, encodings))
+    return Estimate(last, steps, final_seen, final_encoding, target_encoding)
+
+
+def estimate_subsampled(model: Model, source: Cloud, target: Cloud) -> Estimate:
+    """``estimate``, on at most ``config.points`` points of each normalised cloud."""
+    return estimate(model, subsample(source, model.config.points), subsample(target, model.config.points))
+
+
+def predict(model: Model, source: Cloud, target: Cloud) -> Rigid:
+    """The network's transform between two clouds in any units: normalises, estimates, undoes the normalisation."""
+    source, target, frame = normalize_pair(source, target)
+    rotation, translation = estimate_subsampled(model, source, target).transform
+    return Rigid(rotation, denormalize_translation(rotation, translation, frame))
+
+
+def point_regions(model: Model, points: Array, encoding: Encoding, *, batch_size: int = 16_384) -> Array:
+    """The region label (N,) int32 of any points (N, 3) in the network's frame; zeros for model A.
+
+    Large clouds go through in chunks of ``batch_size`` points, so that memory stays bounded.
+    """
+    if not model.config.has_regions:
+        return jnp.zeros(points.shape[0], jnp.int32)
+
+    def label(some: Array) -> Array:
+        return region_labels(branch_logits(model.config, model.params["partition"], some, encoding.embedding))
+
+    if points.shape[0] <= batch_size:
+        return label(points)
+    return jax.lax.map(lambda point: label(point[None])[0], points, batch_size=batch_size)

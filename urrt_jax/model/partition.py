@@ -1,0 +1,142 @@
+"""Region partition: n branches say to which region a point belongs and whether it lies inside the shape.
+
+One set of branches serves source and target, so that region k means the same part in both.
+"""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.model.blocks import run
+from urrt_jax.model.config import ModelConfig
+
+
+class Regions(NamedTuple):
+    """The regions of one cloud.
+
+    Attributes:
+      labels: (N,) int32, the region of every point; padding has label 0 and counts nowhere.
+      counts: (n,) float, real points in each region, N_k.
+      features: (n, d), the region feature sequence l, and after attention the sequence a; zero for an empty region.
+      centroids: (n, 3), the mean of each region's points, in the network's frame; zero for an empty region.
+    """
+
+    labels: Array
+    counts: Array
+    features: Array
+    centroids: Array
+
+
+class RegionBranches(nn.Module):
+    """The functions {h_k} of eq. (1): n perceptrons of [x, e] with one hidden layer, each with weights of its own.
+
+    The hidden layer is split into a part for x and a part for e, which is the same layer, but e's part is computed once
+    a shape instead of once a point; the branches' hidden layers run side by side as one wide layer.
+
+    Each branch starts as a blob about an anchor of its own: hidden units that look away from the anchor in all
+    directions, summed with negative weights. Started at random, one branch wins everywhere, only winners have a
+    gradient, and the partition collapses to a single region.
+    """
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, points: Array, embedding: Array) -> Array:
+        """Branch logits (Q, n) of points (Q, 3), given the shape embedding (d,)."""
+        n, width = self.config.regions, self.config.branch_width
+        directions = self.param("directions", _unit_columns, (3, n * width))
+        offsets = self.param("offsets", lambda _: -jnp.sum(directions * jnp.repeat(anchors(n), width, 0).T, axis=0))
+        faint = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
+        shape = nn.Dense(n * width, use_bias=False, kernel_init=faint, name="shape")(embedding)
+        # A unit looking along u rises by |x|/4 on average over all directions u: the sum falls by 4 a unit of length.
+        out = self.param("out", nn.initializers.constant(-16.0 / width), (n, width, 1))
+        bias = self.param("bias", nn.initializers.constant(2.0), (n,))
+        hidden = nn.leaky_relu(points @ directions + offsets + shape, 0.02)
+        # One product with a block-diagonal matrix: n small ones are slower on every device tried.
+        return hidden @ jax.scipy.linalg.block_diag(*out) + bias
+
+
+def anchors(count: int) -> Array:
+    """``count`` points spread evenly over the sphere of radius 0.8 (a golden spiral), (count, 3)."""
+    place = jnp.arange(count) + 0.5
+    height = 1 - 2 * place / count
+    turn = jnp.pi * (1 + jnp.sqrt(5.0)) * place
+    ring = jnp.sqrt(1 - height**2)
+    return 0.8 * jnp.stack([ring * jnp.cos(turn), ring * jnp.sin(turn), height], axis=1)
+
+
+def _unit_columns(key: Array, shape: tuple[int, int]) -> Array:
+    columns = jax.random.normal(key, shape)
+    return columns / jnp.linalg.norm(columns, axis=0)
+
+
+def branch_logits(config: ModelConfig, params: dict, points: Array, embedding: Array) -> Array:
+    """h_k([x, e]) for all k: (Q, n), for any points (Q, 3) in the network's frame, on the cloud or off it."""
+    return run(RegionBranches(config), params, points, embedding)
+
+
+def region_scores(logits: Array) -> Array:
+    """s_k of eq. (1): the probability (..., n) of every region."""
+    return jax.nn.softmax(logits, axis=-1)
+
+
+def region_labels(logits: Array) -> Array:
+    """The region label o (...,): the region of the highest score. Hard; no derivative passes."""
+    return jnp.argmax(jax.lax.stop_gradient(logits), axis=-1).astype(jnp.int32)
+
+
+def occupancy_logits(logits: Array) -> Array:
+    """The logit (...,) of lying inside the shape: the largest branch logit.
+
+    The paper max-pools the softmax, whose maximum cannot fall below 1/n and so cannot say "outside"; the branches'
+    own logits can (Chen et al. 2019, BAE-NET).
+    """
+    return jnp.max(logits, axis=-1)
+
+
+@jax.custom_jvp
+def pool_by_label(features: Array, labels: Array, groups: Array) -> Array:
+    """The maximum of ``features`` (N, d) over each label; ``groups`` is arange(n + 1), and label n is dropped: (n, d).
+
+    A label without points gives −inf. The derivative goes to the first point that reaches the maximum.
+    """
+    return jax.ops.segment_max(features, labels, groups.shape[0])[:-1]
+
+
+@pool_by_label.defjvp
+def _pool_by_label_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    features, labels, groups = primals
+    pooled = pool_by_label(features, labels, groups)
+    size = features.shape[0]
+    rows = jnp.arange(size)[:, None]
+    reaches = features == jnp.concatenate([pooled, jnp.full_like(pooled[:1], jnp.inf)])[labels]
+    winner = jax.ops.segment_min(jnp.where(reaches, rows, size), labels, groups.shape[0])[:-1]
+    tangent = jnp.take_along_axis(tangents[0], jnp.clip(winner, 0, size - 1), axis=0)
+    return pooled, jnp.where(jnp.isfinite(pooled), tangent, 0.0)
+
+
+def split_regions(cloud: Cloud, features: Array, labels: Array, regions: int) -> Regions:
+    """The regions of a cloud: counts, max-pooled features (the sequence l) and centroids.
+
+    Args:
+      cloud: N points.
+      features: (N, d) point embeddings.
+      labels: (N,) int.
+      regions: n.
+    """
+    labels = jnp.where(cloud.mask, labels, 0)
+    kept = jnp.where(cloud.mask, labels, regions)
+    member = (kept[:, None] == jnp.arange(regions)).astype(cloud.points.dtype)
+    counts = jnp.sum(member, axis=0)
+    sums = jnp.matmul(member.T, cloud.points, precision=jax.lax.Precision.HIGHEST)
+    pooled = pool_by_label(features, kept, jnp.arange(regions + 1))
+    return Regions(
+        labels=labels,
+        counts=counts,
+        features=jnp.where(counts[:, None] > 0, pooled, 0.0),
+        centroids=sums / jnp.maximum(counts, 1.0)[:, None],
+    )

@@ -1,0 +1,226 @@
+"""The training loop: steps, log, validation, checkpoints; it can be killed at any moment and started again."""
+
+import dataclasses
+import json
+import math
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+from tqdm import tqdm
+
+from urrt_jax.data import Shapes
+from urrt_jax.model import Model
+from urrt_jax.training.checkpoints import Checkpoints
+from urrt_jax.training.state import TrainConfig, TrainState, init_state
+from urrt_jax.training.step import train_steps
+from urrt_jax.training.validation import validate, validation_pairs
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """How a run is watched; nothing here changes the weights, except by stopping early.
+
+    Attributes:
+      every: steps between validations; each is followed by a checkpoint.
+      log_every: steps between lines of the log.
+      validation_pairs: pairs of each kind in a validation.
+      patience: validations without a better one after which training stops; 0 never stops early.
+      keep: newest checkpoints that stay, beside the best.
+      progress: whether a progress bar is shown.
+    """
+
+    every: int = 500
+    log_every: int = 50
+    validation_pairs: int = 256
+    patience: int = 0
+    keep: int = 2
+    progress: bool = True
+
+
+def train(
+    config: TrainConfig,
+    shapes: Shapes,
+    validation: Shapes,
+    directory: str | Path,
+    *,
+    loop: LoopConfig = LoopConfig(),
+) -> Model:
+    """The best model of a run, by validation loss; the run continues where ``directory`` left off.
+
+    The folder holds ``config.json``, ``metrics.jsonl`` (one object a line: ``kind`` "train" or "validation", ``step``
+    and the metrics) and ``checkpoints/``. A resumed run is bit-equal to one that was never stopped. Ctrl-C saves first.
+
+    Args:
+      config: what is trained; must agree with the folder's.
+      shapes: to train on.
+      validation: held out of the same split; checkpoints are chosen by these.
+      directory: of the run.
+      loop: how it is watched.
+
+    Raises:
+      ValueError: the folder holds a run with another configuration, or the intervals do not fit ``steps_per_call``.
+      FloatingPointError: a whole interval of steps had non-finite gradients.
+      KeyboardInterrupt: on Ctrl-C, after the state was saved.
+    """
+    for name in ("every", "log_every"):
+        if getattr(loop, name) % config.steps_per_call:
+            raise ValueError(f"{name}: {getattr(loop, name)} is no multiple of steps_per_call, {config.steps_per_call}")
+    mesh = jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    with Checkpoints(directory, config, keep=loop.keep) as checkpoints, jax.set_mesh(mesh):
+        state = jax.device_put(init_state(config), everywhere)
+        state = checkpoints.restore_latest(state) or state
+        arrays = jax.device_put(_arrays(shapes), everywhere)
+        held_out = validation_pairs(config, _arrays(validation), loop.validation_pairs)
+        log = Log(Path(directory) / "metrics.jsonl", int(state.step))
+        with _Interruption() as interruption:
+            state = _run(config, loop, state, arrays, held_out, checkpoints, log, interruption)
+        if interruption.requested:
+            checkpoints.save(state)
+            raise KeyboardInterrupt
+        best = checkpoints.restore_best(state)
+        return Model(config.model, jax.device_get((best or state).params))
+
+
+class _Interruption:
+    """Turns the first Ctrl-C into a request to stop between two steps, when the state is whole; a second one is not
+    held back. Outside the main thread, where signals never arrive, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def __enter__(self) -> "_Interruption":
+        self._main = threading.current_thread() is threading.main_thread()
+        if self._main:
+            self._before = signal.signal(signal.SIGINT, self._request)
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._main:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def _run(
+    config: TrainConfig,
+    loop: LoopConfig,
+    state: TrainState,
+    arrays: dict[str, jax.Array],
+    held_out: dict[str, Any],
+    checkpoints: Checkpoints,
+    log: "Log",
+    interruption: _Interruption,
+) -> TrainState:
+    """The state at the end of the run, or at the step after which it was interrupted."""
+    step = int(state.step)
+    rate, pending, skipped = _Rate(step), None, []
+    with tqdm(total=config.steps, initial=step, unit="step", disable=not loop.progress, dynamic_ncols=True) as bar:
+        while step < config.steps and not log.stalled(loop.patience) and not interruption.requested:
+            state, metrics = train_steps(state, arrays, config)
+            step += config.steps_per_call
+            # The metrics of the interval before are fetched while this step runs on the device.
+            if pending is not None:
+                _report(log, bar, rate, config, *pending)
+            skipped.append(metrics["skipped"])
+            pending = None
+            if step % loop.log_every == 0 or step == config.steps:
+                pending = step, metrics | {"skipped": sum(skipped) / len(skipped)}
+                skipped = []
+            bar.update(config.steps_per_call)
+            if step % loop.every == 0 or step == config.steps:
+                if pending is not None:
+                    _report(log, bar, rate, config, *pending)
+                    pending = None
+                result = validate(state.params, held_out, config)
+                log.write("validation", step, result)
+                checkpoints.save(state, result["validation_loss"])
+                if loop.progress:
+                    bar.write(_sentence(step, result))
+                rate = _Rate(step)
+        if pending is not None:
+            _report(log, bar, rate, config, *pending)
+    return state
+
+
+class _Rate:
+    """Steps a second since the last call, or since it was made."""
+
+    def __init__(self, step: int) -> None:
+        self._step, self._time = step, time.perf_counter()
+
+    def __call__(self, step: int) -> float:
+        before, self._step = self._step, step
+        since, self._time = self._time, time.perf_counter()
+        return (step - before) / (self._time - since)
+
+
+def _report(log: "Log", bar: tqdm, rate: _Rate, config: TrainConfig, step: int, metrics: dict[str, jax.Array]) -> None:
+    values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+    if values["skipped"] == 1.0:
+        raise FloatingPointError(f"every gradient up to step {step} was not finite; lower the learning rate")
+    pairs = rate(step) * config.batch
+    log.write("train", step, values | {"pairs_per_second": round(pairs, 1)})
+    bar.set_postfix(loss=f"{values['loss']:.4f}", chamfer=f"{values['chamfer']:.4f}", pairs_s=f"{pairs:.0f}")
+
+
+def _sentence(step: int, result: dict[str, float]) -> str:
+    parts = [f"{name} {value:.4g}" for name, value in result.items() if not name.endswith("recall_5deg")]
+    return f"step {step}: " + ", ".join(parts)
+
+
+def _arrays(shapes: Shapes) -> dict[str, jax.Array]:
+    arrays = {"points": jnp.asarray(shapes.points)}
+    if shapes.queries is not None and shapes.inside is not None:
+        arrays |= {"queries": jnp.asarray(shapes.queries), "inside": jnp.asarray(shapes.inside)}
+    return arrays
+
+
+class Log:
+    """The run's metrics as JSON lines; lines beyond ``step``, from a run that was killed later, are dropped."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self._path = path
+        self._losses: list[float] = []
+        kept = []
+        if path.exists():
+            for line in path.read_text().splitlines():
+                try:
+                    entry = json.loads(line)
+                except json.JSONDecodeError:  # the kill hit the middle of a line
+                    continue
+                if entry["step"] <= step:
+                    kept.append(line)
+                    self._note(entry)
+        temporary = path.with_suffix(".tmp")
+        temporary.write_text("".join(line + "\n" for line in kept))
+        os.replace(temporary, path)
+
+    def write(self, kind: str, step: int, values: dict[str, float]) -> None:
+        """Appends one line."""
+        entry = {"kind": kind, "step": step, **{name: float(f"{value:.6g}") for name, value in values.items()}}
+        self._note(entry)
+        with self._path.open("a") as file:
+            file.write(json.dumps(entry) + "\n")
+
+    def stalled(self, patience: int) -> bool:
+        """Whether the last ``patience`` validations brought nothing better than those before."""
+        before = self._losses[: len(self._losses) - patience]
+        return patience > 0 and bool(before) and min(self._losses[-patience:]) >= min(before)
+
+    def _note(self, entry: dict[str, Any]) -> None:
+        if entry["kind"] == "validation":
+            loss = entry["validation_loss"]
+            self._losses.append(loss if math.isfinite(loss) else math.inf)

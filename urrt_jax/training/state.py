@@ -1,0 +1,101 @@
+"""What training carries from step to step, and the configuration that fixes how."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from urrt_jax.model import ModelConfig, init_model
+from urrt_jax.training.pairs import PairConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """One training run. Everything that influences the weights is here; it is stored beside every checkpoint.
+
+    Attributes:
+      model: the network.
+      pairs: how pairs are drawn and corrupted.
+      steps: optimiser steps.
+      batch: pairs a step.
+      learning_rate: its peak, after ``warmup`` steps; then a cosine down to a hundredth of it.
+      warmup: steps of linear warm-up.
+      weight_decay: AdamW's, on matrices only.
+      clip: largest global norm of the gradient.
+      occupancy_weight: weight of the occupancy loss against the Chamfer loss.
+      occupancy_queries: points at which occupancy is asked, per pair.
+      chamfer_scale: scale of the Chamfer penalty, in units of the normalised pair.
+      loss_points: points of each whole cloud that the Chamfer loss compares.
+      steps_per_call: steps that run as one dispatch (``lax.scan``).
+      seed: of the initial weights and of every pair.
+    """
+
+    model: ModelConfig = ModelConfig()
+    pairs: PairConfig = PairConfig()
+    steps: int = 10_000
+    batch: int = 32
+    learning_rate: float = 1e-3
+    warmup: int = 200
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    occupancy_weight: float = 0.02
+    occupancy_queries: int = 256
+    chamfer_scale: float = 0.1
+    loss_points: int = 512
+    steps_per_call: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "occupancy_queries", "loss_points", "steps_per_call"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        for name in ("learning_rate", "clip", "chamfer_scale"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("warmup", "weight_decay", "occupancy_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
+        if self.steps % self.steps_per_call:
+            raise ValueError(f"steps_per_call: {self.steps_per_call} does not divide steps, {self.steps}")
+        if self.loss_points > self.pairs.points:
+            raise ValueError(f"loss_points: {self.loss_points} exceeds the {self.pairs.points} points of a pair")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrainState:
+    """Step number, parameters and optimiser state: all that a checkpoint holds."""
+
+    step: Array
+    params: dict
+    opt_state: Any
+
+
+def optimizer(config: TrainConfig) -> optax.GradientTransformation:
+    """AdamW with a global-norm clip, linear warm-up and cosine decay."""
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0,
+        config.learning_rate,
+        min(config.warmup, config.steps // 2),
+        config.steps,
+        config.learning_rate / 100,
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip),
+        optax.adamw(
+            schedule,
+            weight_decay=config.weight_decay,
+            mask=lambda params: jax.tree.map(lambda leaf: leaf.ndim > 1, params),
+        ),
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init_state(config: TrainConfig) -> TrainState:
+    """The state before the first step: a pure function of the configuration."""
+    params = init_model(jax.random.key(config.seed), config.model).params
+    return TrainState(jnp.zeros((), jnp.int32), params, optimizer(config).init(params))
