@@ -189,11 +189,11 @@ def _register(
 
     touching = _REACH_SPACINGS * jnp.maximum(_coarser_spacing(source, target), 1e-6)
     reach = touching if inlier_distance is None else jnp.asarray(inlier_distance) / frame.scale
-    fitness, rmse = overlap(source, target, transform, reach)
-    contact = jnp.maximum(
-        overlap(thin(source, _CONTACT_POINTS), target, transform, touching)[0],
-        overlap(thin(target, _CONTACT_POINTS), source, rigid.inverse(transform), touching)[0],
-    )
+    distances = nearest(rigid.apply(transform, source.points), target).squared
+    fitness, rmse = inlier_share(source.mask, distances, reach)
+    some = thin(target, _CONTACT_POINTS)
+    back = nearest(rigid.apply(rigid.inverse(transform), some.points), source).squared
+    contact = jnp.maximum(inlier_share(source.mask, distances, touching)[0], inlier_share(some.mask, back, touching)[0])
     usable = well_posed(source) & well_posed(target) & jnp.all(jnp.isfinite(transform.translation))
     seen = rigid.apply(answer.seen, source.points)
     return Registration(
@@ -213,14 +213,13 @@ def _register(
     )
 
 
-def overlap(source: Cloud, target: Cloud, transform: Rigid, reach: Array) -> tuple[Array, Array]:
-    """Fitness and inlier rmse of a transform, at the inlier distance ``reach``; all in one unit."""
-    squared = nearest(rigid.apply(transform, source.points), target).squared
-    inlier = source.mask & (squared <= reach**2)
+def inlier_share(mask: Array, squared: Array, reach: Array) -> tuple[Array, Array]:
+    """The share of real points whose squared distance (N,) is within ``reach``, and the rmse of those, in its unit."""
+    inlier = mask & (squared <= reach**2)
     count = jnp.sum(inlier)
     mean = jnp.sum(jnp.where(inlier, squared, 0.0)) / jnp.maximum(count, 1)
     rmse = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
-    return count / jnp.maximum(jnp.sum(source.mask), 1), rmse
+    return count / jnp.maximum(jnp.sum(mask), 1), rmse
 
 
 def _coarser_spacing(source: Cloud, target: Cloud) -> Array:

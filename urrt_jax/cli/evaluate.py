@@ -39,6 +39,7 @@ class Evaluate:
         import jax
 
         from urrt_jax import __version__, load_model, model_card
+        from urrt_jax.cli.printing import print_skipped
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.evaluation import PROTOCOLS, evaluate
         from urrt_jax.refine import ICP
@@ -47,6 +48,7 @@ class Evaluate:
             raise ValueError(f"protocol: expected one of {sorted(PROTOCOLS)}, got {self.protocol!r}")
         model, source = load_model(self.model), find_data(self.data)
         shapes = load_shapes(source, split=self.split, points=self.points, limit=self.limit, progress=True)
+        print_skipped(shapes.skipped)
         evaluation = evaluate(
             model,
             shapes.points,

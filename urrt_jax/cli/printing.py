@@ -1,5 +1,7 @@
 """How a registration is printed: for people and for programs."""
 
+import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,3 +39,11 @@ def as_table(result: Registration) -> str:
         "converged    yes" if result.converged else "converged    NO       do not rely on this transform",
     ]
     return "\n".join(lines)
+
+
+def print_skipped(skipped: Sequence[tuple[str, str]]) -> None:
+    """Names the files that could not be used, on stderr, and how many they are."""
+    for name, reason in skipped:
+        print(f"skipped {name}: {reason}", file=sys.stderr)
+    if skipped:
+        print(f"{len(skipped)} files skipped", file=sys.stderr)

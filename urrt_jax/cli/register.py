@@ -23,7 +23,7 @@ class Register:
         picture: Write a picture of before and after here (.png, .pdf or .svg).
         no_refine: Keep the network's own estimate, without ICP.
         model: Name of a packaged model, or a file written by 'urrt train'.
-        inlier_distance: What counts as touching in fitness and rmse, in the clouds' unit; by default 2.5 times the
+        inlier_distance: What counts as touching in fitness and rmse, in the clouds' unit; by default 1.5 times the
             spacing of the sparser cloud.
         samples: Points to draw on a mesh with faces.
     """

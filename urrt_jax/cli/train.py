@@ -140,6 +140,7 @@ class Train:
         import jax
 
         from urrt_jax import __version__, save_model
+        from urrt_jax.cli.printing import print_skipped
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.training.loop import LoopConfig, train
 
@@ -152,7 +153,8 @@ class Train:
         )
         loaded = load_shapes(source, points=self.pairs.points, limit=self.limit, queries=self.queries, progress=True)
         shapes, validation = loaded.split_validation(self.validation_share, self.seed)
-        print(f"{len(shapes)} shapes to train on, {len(validation)} held out; {len(loaded.skipped)} files skipped")
+        print(f"{len(shapes)} shapes to train on, {len(validation)} held out")
+        print_skipped(loaded.skipped)
         resumed, start = (self.out / "config.json").exists(), time.perf_counter()
         try:
             model = train(config, shapes, validation, self.out, loop=loop)

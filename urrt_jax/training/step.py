@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import PartitionSpec
 
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud, normalize_pair, shift
@@ -97,15 +98,24 @@ def train_steps(state: TrainState, shapes: dict[str, Array], config: TrainConfig
     """The state after ``config.steps_per_call`` steps in one dispatch, and the mean of their metrics.
 
     Every batch is a pure function of (seed, step), made on the device from ``shapes`` (see ``make_batch``), and split
-    over the devices of the current mesh's axis "data" where there is one.
+    over the devices of the current mesh's axis "data" where there is one that divides it.
     """
 
     def one(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key = jax.random.fold_in(jax.random.key(config.seed + 2), state.step)
         share = corruption_share(config.pairs, state.step / config.steps)
-        return update(state, make_batch(key, shapes, config.pairs, config.batch, share), config)
+        batch = make_batch(key, shapes, config.pairs, config.batch, share)
+        return update(state, _spread(batch, config.batch), config)
 
     if config.steps_per_call == 1:
         return one(state, None)
     state, metrics = jax.lax.scan(one, state, None, length=config.steps_per_call)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def _spread(batch: Pair, size: int) -> Pair:
+    """The batch, split over the mesh's axis "data" where there is one that divides it."""
+    mesh = jax.sharding.get_abstract_mesh()
+    if "data" not in mesh.axis_names or size % mesh.shape["data"]:
+        return batch
+    return jax.lax.with_sharding_constraint(batch, PartitionSpec("data"))

@@ -1,0 +1,45 @@
+"""A step on two devices gives what one device gives; in a subprocess, because devices are fixed when JAX starts."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+_STEP = """
+    import json
+    import jax, numpy as np
+    from jax.sharding import AxisType, NamedSharding, PartitionSpec
+    from urrt_jax.model import ModelConfig
+    from urrt_jax.training.pairs import PairConfig
+    from urrt_jax.training.state import TrainConfig, init_state
+    from urrt_jax.training.step import train_steps
+
+    config = TrainConfig(
+        batch=4, model=ModelConfig(width=16, encoder_widths=(16,), branch_width=8, decoder_widths=(16,), points=32),
+        pairs=PairConfig(points=64), loss_points=32)
+    mesh = jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
+    with jax.set_mesh(mesh):
+        everywhere = NamedSharding(mesh, PartitionSpec())
+        points = np.random.default_rng(0).normal(size=(8, 64, 3)).astype(np.float32)
+        shapes = {"points": jax.device_put(points, everywhere)}
+        _, metrics = train_steps(jax.device_put(init_state(config), everywhere), shapes, config)
+    print(json.dumps({"devices": jax.device_count()} | {name: float(value) for name, value in metrics.items()}))
+"""
+
+
+def first_step(devices: int) -> dict:
+    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    command = [sys.executable, "-c", textwrap.dedent(_STEP)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout)
+
+
+def test_first_step_on_two_devices_agrees_with_one():
+    one, two = first_step(1), first_step(2)
+    assert (one["devices"], two["devices"]) == (1, 2)
+    for name in ("loss", "chamfer", "occupancy", "gradient_norm"):
+        assert two[name] == pytest.approx(one[name], rel=1e-4), name
