@@ -471,7 +471,8 @@ def test_fitness_and_rmse_agree_with_a_kd_tree_over_all_points(call, make_cloud_
 
 
 def test_default_inlier_distance_is_one_and_a_half_spacings(plain, cloud):
-    spacing = np.sqrt(np.mean(cKDTree(cloud).query(cloud, k=2)[0][:, 1] ** 2))
+    apart = cKDTree(cloud).query(cloud, k=2)[0][:, 1]
+    spacing = np.sqrt(np.mean(np.minimum(apart, 3 * np.sort(apart)[len(apart) // 2]) ** 2))
     assert float(plain.inlier_distance) == pytest.approx(1.5 * spacing, rel=1e-3)
 
 
@@ -516,3 +517,49 @@ def test_two_clouds_of_200_000_points_take_less_than_two_gibibytes():
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert int(done.stdout) * 1024 < 2 * 2**30
+
+
+@pytest.mark.parametrize("radii", [10.0, 100.0, 1000.0])
+def test_one_stray_point_does_not_move_the_inlier_distance(small_model, cloud, radii):
+    stray = cloud.copy()
+    stray[0] = [radii, 0.0, 0.0]
+    plain = register(cloud, cloud, model=small_model)
+    spoiled = register(stray, cloud, model=small_model)
+    assert float(spoiled.inlier_distance) == pytest.approx(float(plain.inlier_distance), rel=0.1)
+
+
+def test_host_batch_applies_every_transform_to_its_own_cloud(small_model, cloud):
+    """Three clouds of three points, where a shift along the wrong axis would go unnoticed by the shapes."""
+    sources = np.stack([cloud, cloud + 1, cloud + 2])
+    batch = jax.vmap(lambda a: register(a, cloud, model=small_model))(sources)
+    host = jax.device_get(batch)
+    np.testing.assert_allclose(host.apply(sources[:, :3]), batch.apply(sources[:, :3]), atol=1e-5)
+    assert host.matrix.shape == (3, 4, 4)
+
+
+def test_matrix_keeps_the_digits_of_map_coordinates(small_model, cloud):
+    far = np.array([5e6, 4e5, 300.0])
+    result = register(cloud.astype(np.float64) + far, cloud.astype(np.float64) + far, model=small_model)
+    assert result.matrix.dtype == np.float64
+    np.testing.assert_allclose(result.matrix[:3, 3], result.translation, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"model": "modelnet40"}, "model"),
+        ({"refine": True}, "refine"),
+        ({"inlier_distance": np.ones(3)}, "inlier_distance"),
+        ({"source_mask": np.arange(200)}, "source_mask"),
+    ],
+)
+def test_options_of_the_wrong_kind_are_named(cloud, options, name):
+    with pytest.raises(ValueError, match=name):
+        register(cloud[:200], cloud[:200], **options)
+
+
+def test_coordinates_too_large_for_float32_are_refused(small_model, cloud):
+    huge = cloud.astype(np.float64)
+    huge[0] = 1e39
+    with pytest.raises(ValueError, match="source"):
+        register(huge, cloud, model=small_model)

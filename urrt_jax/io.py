@@ -7,6 +7,7 @@ names it.
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections.abc import Callable
@@ -15,6 +16,8 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from urrt_jax.atomic import write_atomically
 
 if TYPE_CHECKING:
     import trimesh
@@ -142,14 +145,9 @@ def write_cloud(path: str | os.PathLike[str], points: ArrayLike, colors: ArrayLi
         if colors.shape != points.shape or colors.dtype != np.uint8:
             raise ValueError(f"{path}: colours must be uint8 {points.shape}, got {colors.dtype} {colors.shape}")
 
-    # In the same folder, because a move is atomic only within one file system.
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(unfinished, "wb") as file:
-            writers[extension](file, points, colors)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    buffer = io.BytesIO()
+    writers[extension](buffer, points, colors)
+    write_atomically(path, buffer.getvalue())
 
 
 def _load_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -27,11 +27,11 @@ from urrt_jax.model.network import Model, estimate_subsampled, point_regions
 from urrt_jax.refine.icp import ICP, icp
 from urrt_jax.weights import load_model
 
-# Chosen on held-out training shapes, clean and corrupted: at this distance touching tells right from wrong poses best,
-# and 95 % of the right ones touch on more than this share.
+# Chosen on held-out training shapes, clean and corrupted, for telling right poses from wrong ones.
 _REACH_SPACINGS = 1.5
 _LEAST_CONTACT = 0.6
 _CONTACT_POINTS = 4096
+_LARGEST = 1e15
 
 
 @jax.tree_util.register_dataclass
@@ -70,23 +70,25 @@ class Registration:
 
     @property
     def matrix(self) -> Array:
-        """The homogeneous matrix (4, 4)."""
+        """The homogeneous matrix (4, 4); NumPy float64 where the translation is."""
+        if isinstance(self.translation, np.ndarray):
+            bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*self.translation.shape[:-1], 1, 4))
+            top = np.concatenate([self.rotation, self.translation[..., None]], axis=-1)
+            return np.concatenate([top, bottom], axis=-2)  # type: ignore[return-value]
         return rigid.matrix(Rigid(self.rotation, self.translation))
 
     @property
     def transform(self) -> jaxlie.SE3:
-        """The transform as an element of SE(3)."""
+        """The transform as an element of SE(3), in float32."""
         return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(self.rotation), self.translation)
 
     def apply(self, points: ArrayLike) -> Array:
         """The moved points, (..., 3); in float64, on the host, where the translation is."""
+        shift = self.translation[..., None, :] if self.translation.ndim > 1 else self.translation
         if isinstance(self.translation, np.ndarray):
             turn = np.swapaxes(np.asarray(self.rotation, np.float64), -1, -2)
-            return np.asarray(points, np.float64) @ turn + self.translation  # type: ignore[return-value]
-        points = jnp.asarray(points)
-        moved = rigid.rotate(self.rotation, points)
-        batched = self.translation.ndim > 1
-        return moved + (self.translation[..., None, :] if batched else self.translation)
+            return np.asarray(points, np.float64) @ turn + shift  # type: ignore[return-value]
+        return rigid.rotate(self.rotation, jnp.asarray(points)) + shift
 
 
 def register(
@@ -130,24 +132,33 @@ def register(
     """
     check_cloud(source, source_mask, "source")
     check_cloud(target, target_mask, "target")
+    if not (model is None or isinstance(model, Model)):
+        raise ValueError(f"model: expected a Model, as load_model gives, got {model!r:.80}")
+    if not (refine is None or isinstance(refine, ICP)):
+        raise ValueError(f"refine: expected an ICP or None, got {refine!r:.80}")
+    if np.ndim(inlier_distance) != 0:  # type: ignore[arg-type]
+        raise ValueError(f"inlier_distance: expected one number, got shape {np.shape(inlier_distance)}")  # type: ignore[arg-type]
     known = inlier_distance is not None and not isinstance(inlier_distance, Tracer)
     if known and not np.all(np.asarray(inlier_distance) > 0):
         raise ValueError(f"inlier_distance: expected a positive length, got {inlier_distance}")
     model = load_model() if model is None else model
-    source, source_origin = _near_origin(source, source_mask)
-    target, target_origin = _near_origin(target, target_mask)
+    source, source_origin = _near_origin(source, source_mask, "source")
+    target, target_origin = _near_origin(target, target_mask, "target")
     result = _register(source, target, source_mask, target_mask, model, refine, inlier_distance)
     return _restore_origins(result, source_origin, target_origin)
 
 
-def _near_origin(points: ArrayLike, mask: ArrayLike | None) -> tuple[Array, np.ndarray | None]:
+def _near_origin(points: ArrayLike, mask: ArrayLike | None, name: str) -> tuple[Array, np.ndarray | None]:
     """The points as float32 and the origin (3,) that was subtracted; only host arrays of more digits need one."""
     if isinstance(points, jax.Array) or getattr(points, "dtype", None) == np.float32:
         return jnp.asarray(points), None
     values = np.asarray(points, np.float64)
     real = values if mask is None or isinstance(mask, Tracer) else values[np.asarray(mask, bool)]
     origin = real[np.all(np.isfinite(real), axis=-1)].mean(axis=0)
-    return jnp.asarray((values - origin).astype(np.float32)), origin
+    centred = values - origin
+    if not np.all(np.abs(centred[np.isfinite(centred)]) < _LARGEST):
+        raise ValueError(f"{name}: coordinates beyond ±{_LARGEST:g} about their mean are too large for float32")
+    return jnp.asarray(centred.astype(np.float32)), origin
 
 
 def _restore_origins(result: Registration, source: np.ndarray | None, target: np.ndarray | None) -> Registration:

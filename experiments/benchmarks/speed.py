@@ -3,7 +3,8 @@
     python experiments/benchmarks/speed.py [--data PATH] [--pairs 256]
 
 Pairs follow the clean DCP protocol, 1,024 points, on the test split of PATH (procedural shapes by default). Each figure
-is the median of its repeats, after a warm-up that compiles. Open3D is optional: `pip install 'urrt-jax[peers]'`.
+is taken after a warm-up that compiles: the median of the repeats, for Open3D the mean over the pairs, for the large
+pairs one run. Open3D is optional: `pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
 """
 
 import argparse
@@ -116,7 +117,8 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
         name = f"Open3D {open3d.__version__} ICP from the centroids, one pair a call"
         rows.append(row(name, statistics.mean(single), summarize(errors)["recall_1deg"]))
     return {
-        "command": f"python experiments/benchmarks/speed.py --pairs {pairs} --repeats {repeats}",
+        "command": "python experiments/benchmarks/speed.py "
+        f"--data {Path(data).name} --pairs {pairs} --repeats {repeats}",
         "data": Path(data).name,
         "pairs": count,
         "points": 1024,
@@ -155,6 +157,8 @@ if __name__ == "__main__":
     parser.add_argument("--pairs", type=int, default=256, help="how many pairs, a multiple of 64")
     parser.add_argument("--repeats", type=int, default=5, help="timed repeats of the batched rows")
     given = parser.parse_args()
+    if given.pairs < BATCH:
+        parser.error(f"--pairs: expected at least {BATCH}, got {given.pairs}")
     result = measure(find_data(given.data), given.pairs, given.repeats)
     (HERE / "speed.json").write_text(json.dumps(result, indent=2) + "\n")
     (HERE / "speed.md").write_text(as_markdown(result))

@@ -164,6 +164,12 @@ def test_spacing_of_a_sample_is_asked_in_the_whole_cloud():
     assert float(spacing(cloud, sample=sample)) == pytest.approx(0.5, rel=1e-5)
 
 
+@pytest.mark.parametrize("distance", [10.0, 1e3, 1e6])
+def test_spacing_is_not_set_by_a_stray_point(distance):
+    stray = np.array([[distance, 0.0, 0.0]], np.float32)
+    assert float(spacing(make_cloud(np.concatenate([_grid(0.5), stray])))) == pytest.approx(0.5, rel=0.05)
+
+
 def test_spacing_has_a_finite_gradient():
     gradient = jax.grad(lambda p: spacing(make_cloud(p)))(jnp.ones((6, 3)))
     assert bool(jnp.all(jnp.isfinite(gradient)))

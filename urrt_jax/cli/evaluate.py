@@ -1,7 +1,7 @@
 """``urrt evaluate``: a model's errors over a data set."""
 
 import json
-import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -39,7 +39,8 @@ class Evaluate:
         import jax
 
         from urrt_jax import __version__, load_model, model_card
-        from urrt_jax.cli.printing import print_skipped
+        from urrt_jax.atomic import write_atomically
+        from urrt_jax.cli.printing import changed_flags, print_skipped
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.evaluation import PROTOCOLS, evaluate
         from urrt_jax.refine import ICP
@@ -63,18 +64,20 @@ class Evaluate:
             "model_sha256": model_card(self.model)["sha256"],
             "versions": {"urrt_jax": __version__, "jax": jax.__version__},
             "device": jax.devices()[0].platform,
+            "command": shlex.join(["urrt", "evaluate", *changed_flags(self)]),
             "data": Path(source).name,
             "split": self.split,
             "points": self.points,
             "refine": not self.no_refine,
         }
-        print(as_table(summary))
-        write_json(self.out, settings | summary)
+        print(figures_table(summary))
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.out, json.dumps(settings | summary, indent=2) + "\n")
         print(f"wrote {self.out}")
         return 0
 
 
-def as_table(summary: dict[str, Any]) -> str:
+def figures_table(summary: dict[str, Any]) -> str:
     """The figures of a summary: a row a figure, a column for each of its groups, then what stands alone."""
     groups = {name: figures for name, figures in summary.items() if isinstance(figures, dict)}
     rows = list(dict.fromkeys(row for figures in groups.values() for row in figures))
@@ -83,17 +86,6 @@ def as_table(summary: dict[str, Any]) -> str:
         lines.append(f"{row:<20}" + "".join(f"{figures.get(row, float('nan')):>12.5g}" for figures in groups.values()))
     lines += [f"{name:<20}{_short(value):>12}" for name, value in summary.items() if name not in groups]
     return "\n".join(lines)
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes the file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        unfinished.write_text(json.dumps(content, indent=2) + "\n")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _short(value: Any) -> str:

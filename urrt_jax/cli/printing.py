@@ -2,6 +2,8 @@
 
 import sys
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,7 @@ from urrt_jax.registration import Registration
 
 def as_dict(result: Registration) -> dict[str, Any]:
     """What ``--json`` prints."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = result.rotation, result.translation
+    matrix = np.asarray(result.matrix, np.float64)
     return {
         "matrix": matrix.tolist(),
         "rotation": matrix[:3, :3].tolist(),
@@ -47,3 +48,17 @@ def print_skipped(skipped: Sequence[tuple[str, str]]) -> None:
         print(f"skipped {name}: {reason}", file=sys.stderr)
     if skipped:
         print(f"{len(skipped)} files skipped", file=sys.stderr)
+
+
+def changed_flags(flags: Any, prefix: str = "") -> list[str]:
+    """The flags of a command whose values are not the defaults, as they are typed, with names in the place of paths."""
+    typed = []
+    for field in fields(flags):
+        value, name = getattr(flags, field.name), prefix + field.name.replace("_", "-")
+        if is_dataclass(value):
+            typed += changed_flags(value, f"{name}.")
+        elif value is True:
+            typed.append(f"--{name}")
+        elif value != field.default:
+            typed += [f"--{name}", Path(value).name if name in ("out", "data") else str(value)]
+    return typed

@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import time
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -155,6 +155,8 @@ class Train:
         shapes, validation = loaded.split_validation(self.validation_share, self.seed)
         print(f"{len(shapes)} shapes to train on, {len(validation)} held out")
         print_skipped(loaded.skipped)
+        occupancy = "a shell around each cloud" if loaded.queries is None else "inside and outside of closed meshes"
+        print(f"the regions learn from {occupancy}")
         resumed, start = (self.out / "config.json").exists(), time.perf_counter()
         try:
             model = train(config, shapes, validation, self.out, loop=loop)
@@ -170,8 +172,10 @@ class Train:
                 "shapes": len(shapes),
                 "validation_shapes": len(validation),
                 "steps": config.steps,
-                "seconds": round(time.perf_counter() - start, 1),
-                "resumed": resumed,  # then the seconds are those of the last part alone
+                # A resumed run's time is not known.
+                "seconds": None if resumed else round(time.perf_counter() - start, 1),
+                "occupancy": occupancy,
+                "training": asdict(config),
                 "versions": {"urrt_jax": __version__} | {name: version(name) for name in ("jax", "flax", "optax")},
                 "processor": f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}",
                 "validation": best_validation(self.out / "metrics.jsonl"),
@@ -183,7 +187,9 @@ class Train:
 
     def command(self) -> str:
         """The command line of this run, with names in the place of paths."""
-        return shlex.join(["urrt", "train", *_changed_flags(self)])
+        from urrt_jax.cli.printing import changed_flags
+
+        return shlex.join(["urrt", "train", *changed_flags(self)])
 
 
 def validations(log: Path) -> list[dict[str, Any]]:
@@ -194,16 +200,6 @@ def validations(log: Path) -> list[dict[str, Any]]:
 
 def best_validation(log: Path) -> dict[str, Any]:
     """The validation with the smallest loss; empty where there is none."""
-    return min(validations(log), key=lambda entry: entry["validation_loss"], default={})
+    from urrt_jax.training.checkpoints import ranking_loss
 
-
-def _changed_flags(flags: Any, prefix: str = "") -> list[str]:
-    """The flags whose values are not the defaults, as they are typed."""
-    typed = []
-    for field in fields(flags):
-        value, name = getattr(flags, field.name), prefix + field.name.replace("_", "-")
-        if is_dataclass(value):
-            typed += _changed_flags(value, f"{name}.")
-        elif value != field.default:
-            typed += [f"--{name}", Path(value).name if name in ("out", "data") else str(value)]
-    return typed
+    return min(validations(log), key=lambda entry: ranking_loss(entry["validation_loss"]), default={})

@@ -26,7 +26,7 @@ def shapes_from_npz(path: Path, *, split: str, points: int, limit: int | None) -
     if not is_shapes_npz(path):
         raise ValueError(f"{path}: needs the keys {_NPZ_KEYS}; it holds {', '.join(held) or 'nothing'}")
 
-    if "label" in held:
+    if {"label", "classes"} <= held.keys():
         classes, labels = held["classes"], held["label"]
     else:
         # Before the filter, so that both splits number the classes alike.

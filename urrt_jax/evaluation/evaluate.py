@@ -21,6 +21,7 @@ class Evaluation:
 
     Attributes:
       protocol: its name.
+      refined: whether the network's estimates were refined.
       items: (B,) int, the items evaluated.
       rotations, translations: (B, 3, 3) and (B, 3), as ``register`` returned them.
       coarse_rotations, coarse_translations: the network's own.
@@ -30,6 +31,7 @@ class Evaluation:
     """
 
     protocol: str
+    refined: bool
     items: np.ndarray
     rotations: np.ndarray
     translations: np.ndarray
@@ -48,12 +50,14 @@ class Evaluation:
 
     def summary(self) -> dict[str, Any]:
         """The figures of the network alone and after refinement, as plain numbers."""
+        refined = {"refined": summarize(self.errors())} if self.refined else {}
         return {
             "protocol": self.protocol,
             "items": len(self.items),
             "network": summarize(self.errors(coarse=True)),
-            "refined": summarize(self.errors()),
+            **refined,
             "converged": float(np.mean(self.converged)),
+            "converged_but_off_by_5deg": float(np.mean(self.converged & (self.errors()["angle"] > 5.0))),
             "fitness_mean": float(np.mean(self.fitness)),
         }
 
@@ -87,6 +91,8 @@ def evaluate(
     chosen = np.arange(len(clouds)) if items is None else np.asarray(items)
     if len(chosen) == 0:
         raise ValueError("items: there is nothing to evaluate")
+    if batch < 1:
+        raise ValueError(f"batch: expected at least 1, got {batch}")
     batch = min(batch, len(chosen))
 
     @jax.jit
@@ -108,11 +114,11 @@ def evaluate(
             part = chosen[start : start + batch]
             # The last batch is filled up with its own first item, so that one compiled program serves all.
             filled = np.concatenate([part, np.full(batch - len(part), part[0])])
-            trials = [PROTOCOLS[protocol](clouds, int(item)) for item in filled]
+            trials = [PROTOCOLS[protocol](clouds, int(item), points=clouds.shape[1]) for item in filled]
             stacked = Trial(*(np.stack(values) for values in zip(*trials, strict=True)))
             output = jax.device_get(align(jnp.asarray(stacked.source), jnp.asarray(stacked.target)))
             output |= {"true_rotations": stacked.rotation, "true_translations": stacked.translation}
             found.append({name: values[: len(part)] for name, values in output.items()})
             bar.update(len(part))
     joined = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    return Evaluation(protocol=protocol, items=chosen, **joined)
+    return Evaluation(protocol=protocol, refined=refine is not None, items=chosen, **joined)

@@ -72,6 +72,10 @@ def check_cloud(points: ArrayLike, mask: ArrayLike | None, name: str) -> None:
         raise ValueError(f"{name}: expected real numbers, got dtype {dtype}")
     if mask is not None and np.shape(mask) != shape[:1]:
         raise ValueError(f"{name}_mask: expected shape {shape[:1]} to match {name}, got {np.shape(mask)}")
+    if mask is not None:
+        kind = _as_array(mask, f"{name}_mask").dtype
+        if kind.kind != "b":
+            raise ValueError(f"{name}_mask: expected booleans, True for real points, got dtype {kind}")
     if isinstance(points, Tracer) or isinstance(mask, Tracer):
         return
     values = np.asarray(points)
@@ -112,7 +116,9 @@ def _has_three_distinct(values: np.ndarray) -> bool:
 
 
 def pad_clouds(clouds: Sequence[ArrayLike], *, size: int | None = None) -> tuple[Array, Array]:
-    """One array for clouds of different sizes: points (B, size, 3) and mask (B, size).
+    """One array for clouds of different sizes: points (B, size, 3) float32 and mask (B, size).
+
+    Clouds at map coordinates lose digits here; subtract an origin from each first.
 
     Args:
       clouds: B arrays (N_i, 3).

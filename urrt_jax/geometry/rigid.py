@@ -6,6 +6,7 @@ rotation runs at ``Precision.HIGHEST``: TF32 would move points of a unit cube by
 
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -138,6 +139,8 @@ def procrustes(source: Array, target: Array, weights: Array) -> Rigid:
       target: (N, 3), row by row the counterparts of ``source``.
       weights: (N,) non-negative; zero leaves a pair out, and an all-zero vector gives the identity.
     """
+    chex.assert_equal_shape([source, target])
+    chex.assert_shape(weights, source.shape[:1])
     total = jnp.sum(weights)
     share = weights / jnp.where(total > 0, total, 1.0)
     source_mean = jnp.matmul(share, source, precision=_HIGHEST)

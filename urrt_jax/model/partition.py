@@ -5,6 +5,7 @@ One set of branches serves source and target, so that region k means the same pa
 
 from typing import NamedTuple
 
+import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -128,6 +129,8 @@ def split_regions(cloud: Cloud, features: Array, labels: Array, regions: int) ->
       labels: (N,) int.
       regions: n.
     """
+    chex.assert_shape(labels, cloud.mask.shape)
+    chex.assert_shape(features, (*cloud.mask.shape, None))
     labels = jnp.where(cloud.mask, labels, 0)
     kept = jnp.where(cloud.mask, labels, regions)
     member = (kept[:, None] == jnp.arange(regions)).astype(cloud.points.dtype)

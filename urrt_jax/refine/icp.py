@@ -21,7 +21,7 @@ from urrt_jax.geometry.rigid import Rigid, procrustes
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ICP:
-    """How to refine. Lengths are in multiples of the target's own spacing, so that units do not matter.
+    """How to refine. Lengths are relative to the clouds, so that units do not matter.
 
     Attributes:
       coarse_points: points of each cloud in the first stage, which looks for the basin; 0 skips that stage.

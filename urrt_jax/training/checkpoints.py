@@ -7,7 +7,6 @@ checkpoints as JSON and must agree at resume.
 import dataclasses
 import json
 import math
-import os
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as ocp
 
+from urrt_jax.atomic import write_atomically
 from urrt_jax.training.state import TrainConfig, TrainState
 
 _METRIC = "validation_loss"
@@ -28,16 +28,19 @@ class Checkpoints:
     Args:
       directory: made if missing.
       config: the run's configuration, written on the first start.
+      data: what identifies the data, kept and compared with it; None compares the configuration alone.
       keep: how many of the newest checkpoints stay, beside the best one.
 
     Raises:
       ValueError: the folder holds a run with another configuration; the message lists the fields that differ.
     """
 
-    def __init__(self, directory: str | Path, config: TrainConfig, *, keep: int = 2) -> None:
+    def __init__(
+        self, directory: str | Path, config: TrainConfig, data: dict[str, Any] | None = None, *, keep: int = 2
+    ) -> None:
         self.directory = Path(directory).absolute()
         self.directory.mkdir(parents=True, exist_ok=True)
-        _agree(self.directory / "config.json", config)
+        _agree(self.directory / "config.json", config, data)
         policies = ocp.training.preservation_policies
         # ``BestN`` keeps the end of the ascending order, so the smallest loss comes last when reversed.
         best = policies.BestN(get_metric_fn=_loss, reverse=True, n=1, keep_checkpoints_without_metrics=False)
@@ -79,10 +82,13 @@ class Checkpoints:
         return TrainState(**self._checkpointer.load(step, _abstract(like)))
 
 
-def _loss(metrics: dict[str, float]) -> float:
+def ranking_loss(loss: float) -> float:
     """The loss to rank by: one that is not a number is the worst."""
-    loss = metrics[_METRIC]
     return loss if math.isfinite(loss) else math.inf
+
+
+def _loss(metrics: dict[str, float]) -> float:
+    return ranking_loss(metrics[_METRIC])
 
 
 def _as_dict(state: TrainState) -> dict[str, Any]:
@@ -96,16 +102,19 @@ def _abstract(state: TrainState) -> dict[str, Any]:
     return jax.tree.map(describe, _as_dict(state))
 
 
-def _agree(path: Path, config: TrainConfig) -> None:
-    """Writes the configuration, or checks it against the one already there."""
+def _agree(path: Path, config: TrainConfig, data: dict[str, Any] | None) -> None:
+    """Writes the configuration and the data's fingerprint, or checks them against those already there."""
     # Through JSON and back, so that tuples and lists compare equal.
-    ours = json.loads(json.dumps(dataclasses.asdict(config)))
+    ours = json.loads(json.dumps(dataclasses.asdict(config) | {"data": data}))
     if not path.exists():
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(ours, indent=2))
-        os.replace(temporary, path)
+        write_atomically(path, json.dumps(ours, indent=2) + "\n")
         return
-    theirs = json.loads(path.read_text())
+    try:
+        theirs = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}, which says how the checkpoints beside it were made, is damaged: {error}") from error
+    if data is None:
+        ours["data"] = theirs.get("data")
     before, now = _flatten(theirs), _flatten(ours)
     differing = [
         f"{name}: {before.get(name)!r} there, {now.get(name)!r} now"

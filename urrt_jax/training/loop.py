@@ -2,11 +2,10 @@
 
 import dataclasses
 import json
-import math
-import os
 import signal
 import threading
 import time
+import zlib
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -16,9 +15,10 @@ import jax.numpy as jnp
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
+from urrt_jax.atomic import write_atomically
 from urrt_jax.data import Shapes
 from urrt_jax.model import Model
-from urrt_jax.training.checkpoints import Checkpoints
+from urrt_jax.training.checkpoints import Checkpoints, ranking_loss
 from urrt_jax.training.state import TrainConfig, TrainState, init_state
 from urrt_jax.training.step import train_steps
 from urrt_jax.training.validation import validate, validation_pairs
@@ -44,6 +44,11 @@ class LoopConfig:
     keep: int = 2
     progress: bool = True
 
+    def __post_init__(self) -> None:
+        for name, least in (("every", 1), ("log_every", 1), ("validation_pairs", 1), ("patience", 0), ("keep", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+
 
 def train(
     config: TrainConfig,
@@ -66,7 +71,8 @@ def train(
       loop: how it is watched.
 
     Raises:
-      ValueError: the folder holds a run with another configuration, or the intervals do not fit ``steps_per_call``.
+      ValueError: the folder holds a run with another configuration or other data, or the intervals do not
+        fit ``steps_per_call``.
       FloatingPointError: a whole interval of steps had non-finite gradients.
       KeyboardInterrupt: on Ctrl-C, after the state was saved.
     """
@@ -75,7 +81,8 @@ def train(
             raise ValueError(f"{name}: {getattr(loop, name)} is no multiple of steps_per_call, {config.steps_per_call}")
     mesh = jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
     everywhere = NamedSharding(mesh, PartitionSpec())
-    with Checkpoints(directory, config, keep=loop.keep) as checkpoints, jax.set_mesh(mesh):
+    data = {"shapes": _fingerprint(shapes), "validation": _fingerprint(validation)}
+    with Checkpoints(directory, config, data, keep=loop.keep) as checkpoints, jax.set_mesh(mesh):
         state = jax.device_put(init_state(config), everywhere)
         state = checkpoints.restore_latest(state) or state
         arrays = jax.device_put(_arrays(shapes), everywhere)
@@ -181,6 +188,15 @@ def _sentence(step: int, result: dict[str, float]) -> str:
     return f"step {step}: " + ", ".join(parts)
 
 
+def _fingerprint(shapes: Shapes) -> dict[str, int]:
+    """How many shapes these are, and a checksum of their points and occupancy samples."""
+    checksum = 0
+    for array in (shapes.points, shapes.queries, shapes.inside):
+        if array is not None:
+            checksum = zlib.crc32(array.tobytes(), checksum)
+    return {"count": len(shapes), "crc32": checksum}
+
+
 def _arrays(shapes: Shapes) -> dict[str, jax.Array]:
     arrays = {"points": jnp.asarray(shapes.points)}
     if shapes.queries is not None and shapes.inside is not None:
@@ -204,9 +220,7 @@ class Log:
                 if entry["step"] <= step:
                     kept.append(line)
                     self._note(entry)
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text("".join(line + "\n" for line in kept))
-        os.replace(temporary, path)
+        write_atomically(path, "".join(line + "\n" for line in kept))
 
     def write(self, kind: str, step: int, values: dict[str, float]) -> None:
         """Appends one line."""
@@ -222,5 +236,4 @@ class Log:
 
     def _note(self, entry: dict[str, Any]) -> None:
         if entry["kind"] == "validation":
-            loss = entry["validation_loss"]
-            self._losses.append(loss if math.isfinite(loss) else math.inf)
+            self._losses.append(ranking_loss(entry["validation_loss"]))

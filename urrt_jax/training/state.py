@@ -15,7 +15,7 @@ from urrt_jax.training.pairs import PairConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """One training run. Everything that influences the weights is here; it is stored beside every checkpoint.
+    """One training run. With the shapes it fixes the weights; both are identified beside the checkpoints.
 
     Attributes:
       model: the network.
@@ -53,6 +53,8 @@ class TrainConfig:
         for name in ("steps", "batch", "occupancy_queries", "loss_points", "steps_per_call"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.seed < 0:
+            raise ValueError(f"seed: expected at least 0, got {self.seed}")
         for name in ("learning_rate", "clip", "chamfer_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")

@@ -8,7 +8,6 @@ import functools
 import hashlib
 import io
 import json
-import os
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from urrt_jax.atomic import write_atomically
 from urrt_jax.model import Model, ModelConfig, init_model
 
 DEFAULT = "modelnet40"
@@ -81,9 +81,7 @@ def save_model(model: Model, path: str | Path, card: dict[str, Any] | None = Non
         "sha256": hashlib.sha256(content).hexdigest(),
     }
     for target, data in ((path, content), (_sibling(path, ".json"), _as_text((card or {}) | described))):
-        temporary = target.with_name(target.name + ".tmp")
-        temporary.write_bytes(data)
-        os.replace(temporary, target)
+        write_atomically(target, data)
     return path
 
 
