@@ -149,6 +149,12 @@ def test_a_mistake_is_one_line_on_stderr(files, capsys, tmp_path, monkeypatch, c
     assert captured.err.startswith("urrt: error: ") and captured.err.count("\n") == 1
 
 
+def test_a_missing_folder_for_the_output_is_named_before_any_work(files, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("urrt_jax.io.read_cloud", lambda *_, **__: pytest.fail("the clouds were read first"))
+    assert register(files, "--out", str(tmp_path / "nowhere" / "moved.ply")) == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
 def test_debugging_shows_the_traceback(files, monkeypatch):
     monkeypatch.setenv("URRT_DEBUG", "1")
     with pytest.raises(FileNotFoundError):

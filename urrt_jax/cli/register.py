@@ -46,6 +46,9 @@ class Register:
         from urrt_jax.refine import ICP
         from urrt_jax.viewer import plot_registration, region_colors
 
+        for path in (self.out, self.picture):
+            if path is not None and not path.parent.is_dir():
+                raise ValueError(f"{path}: there is no folder {path.parent} to write to")
         source, target = (read_cloud(path, samples=self.samples) for path in (self.source, self.target))
         result = register(
             source,
