@@ -46,7 +46,7 @@ def seconds(function: Callable[[], object], repeats: int) -> float:
 
 def open3d_icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Open3D's point-to-point ICP, started at the centroids; the matrix (4, 4)."""
-    import open3d
+    import open3d  # pyright: ignore[reportMissingImports] - an optional peer
 
     clouds = []
     for points in (source, target):
@@ -103,7 +103,7 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
         rows.append(row(f"register, one pair of {size // 2:,} points", took, None))
 
     try:
-        import open3d
+        import open3d  # pyright: ignore[reportMissingImports] - an optional peer
     except ImportError as error:
         rows.append({"method": f"Open3D ICP: not measured ({error}); pip install 'urrt-jax[peers]'"})
     else:
