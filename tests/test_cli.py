@@ -17,6 +17,7 @@ from urrt_jax.cli.demo import demo_pair
 from urrt_jax.cli.printing import as_table
 from urrt_jax.cli.train import NetworkFlags, PairFlags, Train
 from urrt_jax.data import demo_shape
+from urrt_jax.evaluation import load_evaluation
 from urrt_jax.model import ModelConfig
 from urrt_jax.training.loop import LoopConfig
 from urrt_jax.training.pairs import PairConfig
@@ -49,7 +50,7 @@ def register(files: dict[str, Path], *flags: str, source: Path | None = None, ta
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["register"], ["demo"], ["train"], ["evaluate"]], ids=lambda c: "".join(c) or "urrt"
+    "command", [[], ["register"], ["demo"], ["train"], ["evaluate"], ["reproduce"]], ids=lambda c: "".join(c) or "urrt"
 )
 def test_help_answers_without_importing_jax(command):
     program = (
@@ -275,15 +276,56 @@ def test_interrupted_training_says_how_to_continue(capsys, tmp_path, monkeypatch
     assert "the same command continues" in capsys.readouterr().err
 
 
-def test_evaluate_prints_a_table_and_writes_json(files, capsys, tmp_path):
+def test_evaluate_prints_a_table_and_writes_values_beside_json(files, capsys, tmp_path):
     flags = ["--model", str(files["model.npz"]), "--limit", "3", "--points", "100", "--batch", "2"]
-    assert cli.main(["evaluate", *flags, "--out", str(tmp_path / "results.json")]) == 0
+    flags += ["--methods", "identity", "register", "--out", str(tmp_path / "results.json")]
+    assert cli.main(["evaluate", *flags]) == 0
     results = json.loads((tmp_path / "results.json").read_text())
     assert (results["data"], results["model"], results["items"]) == ("procedural", "model.npz", 3)
+    assert results["figures"].keys() == results["failed_items"].keys() == {"identity", "register"}
+    assert "--methods identity register" in results["command"] and "/" not in results["command"]
     out = capsys.readouterr().out
     assert "mae_rotation" in out and "results.json" in out
+    (values,) = (tmp_path / "items").glob("dcp-register-*.npz")
+    assert len(load_evaluation(values)) == 3
+    before = values.read_bytes()
+    assert cli.main(["evaluate", *flags]) == 0  # again: nothing is left to do
+    assert cli.main(["evaluate", *flags, "--protocol", "drift"]) == 0  # another one disturbs nothing
+    assert values.read_bytes() == before and len(list((tmp_path / "items").iterdir())) == 4
 
 
-def test_evaluate_refuses_an_unknown_protocol(files, capsys):
-    assert cli.main(["evaluate", "--protocol", "guess", "--model", str(files["model.npz"])]) == 2
-    assert "protocol: expected one of" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "flags, message",
+    [
+        (["--protocol", "guess"], "protocol: expected one of"),
+        (["--protocol", "drift loud=1"], "options sigma, target_only"),
+        (["--methods", "guess"], "method: expected one of"),
+        (["--limit", "0"], "limit: expected at least 1"),
+        (["--protocol", "scans", "--data", "nowhere.npz"], "nowhere.npz"),
+    ],
+)
+def test_evaluate_refuses_what_it_cannot_do_before_any_work(files, capsys, tmp_path, flags, message):
+    common = ["--model", str(files["model.npz"]), "--out", str(tmp_path / "results.json")]
+    assert cli.main(["evaluate", *common, *flags]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_reproduce_writes_a_table_of_ones_own(files, capsys, tmp_path):
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "config.toml").write_text(
+        'title = "Mine"\nmethods = ["identity", "register"]\ncolumns = ["mae_rotation"]\n'
+        '[[parts]]\ntitle = "clean"\nprotocol = "dcp"\npoints = 100\n'
+    )
+    flags = ["--model", str(files["model.npz"]), "--limit", "2", "--out", str(tmp_path / "out")]
+    assert cli.main(["reproduce", str(own), *flags]) == 0
+    assert "# Mine" in capsys.readouterr().out
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [row["method"] for row in results["parts"][0]["rows"]] == ["identity", "register"]
+    assert str(tmp_path) not in json.dumps(results)
+
+
+def test_reproduce_refuses_an_unknown_table(capsys):
+    assert cli.main(["reproduce", "table9"]) == 2
+    assert "table3_comparison" in capsys.readouterr().err

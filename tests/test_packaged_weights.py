@@ -23,13 +23,13 @@ def test_card_describes_the_weights():
 def test_network_alone_turns_procedural_shapes_most_of_the_way():
     """Shapes of a kind that training never saw: what remains of rotations of some 40 degrees."""
     shapes = load_shapes("procedural", split="test", limit=32)
-    errors = evaluate(urrt_jax.load_model(), shapes.points, progress=False).errors(coarse=True)
+    errors = evaluate("network", "dcp", shapes.points, progress=False).errors()
     assert np.median(errors["angle"]) < 10.0
 
 
 def test_refinement_is_exact_on_most_procedural_shapes():
     shapes = load_shapes("procedural", split="test", limit=32)
-    errors = evaluate(urrt_jax.load_model(), shapes.points, progress=False).errors()
+    errors = evaluate("register", "dcp", shapes.points, progress=False).errors()
     assert np.mean(errors["angle"] < 1.0) >= 0.9
 
 

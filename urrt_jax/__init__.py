@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from urrt_jax.model import Model, ModelConfig
     from urrt_jax.refine import ICP
     from urrt_jax.registration import Registration, register
+    from urrt_jax.search import Search
     from urrt_jax.weights import available_models, load_model, model_card, save_model
 
 __version__ = "0.1.0"
@@ -21,6 +22,7 @@ __all__ = [
     "Model",
     "ModelConfig",
     "Registration",
+    "Search",
     "available_models",
     "load_model",
     "model_card",
@@ -36,6 +38,7 @@ _HOMES = {
     "Model": "urrt_jax.model",
     "ModelConfig": "urrt_jax.model",
     "Registration": "urrt_jax.registration",
+    "Search": "urrt_jax.search",
     "available_models": "urrt_jax.weights",
     "load_model": "urrt_jax.weights",
     "model_card": "urrt_jax.weights",

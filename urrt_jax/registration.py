@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +25,16 @@ from urrt_jax.geometry.neighbors import nearest, spacing
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.network import Model, estimate_subsampled, point_regions
 from urrt_jax.refine.icp import ICP, icp
+from urrt_jax.search import Search
+from urrt_jax.search import search as find_pose
 from urrt_jax.weights import load_model
 
 # Chosen on held-out training shapes, clean and corrupted, for telling right poses from wrong ones.
 _REACH_SPACINGS = 1.5
 _LEAST_CONTACT = 0.6
+# A searched pose may overlap by less, where points that come near mostly touch: surfaces that cross don't.
+_LEAST_SEARCHED_CONTACT = 0.3
+_LEAST_TIGHTNESS = 0.6
 _CONTACT_POINTS = 4096
 _LARGEST = 1e15
 
@@ -50,7 +55,8 @@ class Registration:
       inlier_distance: (), the distance that was used, in the input's units.
       converged: (), bool: the input was finite and not collinear, refinement settled within its iterations (where
         there was refinement), and at least 0.6 of the points of one of the clouds lie within 1.5 spacings of the
-        other. It cannot exclude a wrong pose of a shape that is nearly symmetric, and says no to a small overlap.
+        other; after a search, 0.3 of them, if 0.6 of those within 6 spacings do. It cannot exclude a wrong pose of a
+        shape that is nearly symmetric.
       source_regions: (N,) int32, the region of every source point (as aligned); 0 for padding and for model A.
       target_regions: (M,) int32, the same for the target.
       coarse: the network's own estimate, before refinement.
@@ -99,6 +105,7 @@ def register(
     target_mask: ArrayLike | None = None,
     model: Model | None = None,
     refine: ICP | None = ICP(),
+    search: Search | Literal["auto"] | None = None,
     inlier_distance: ArrayLike | None = None,
 ) -> Registration:
     """The rigid transform that carries ``source`` onto ``target``: ``target ≈ R @ source + t``.
@@ -107,9 +114,11 @@ def register(
     exact on the full clouds. The rotation is the same for any common unit and any origin of either cloud. A pure
     function: the same input gives the same answer, and ``jax.jit``, ``jax.vmap`` and ``jax.grad`` compose with it.
     Derivatives with respect to the clouds pass through the last Procrustes step at fixed correspondences, or, without
-    refinement, through the network's last step, then also to the model's parameters.
+    refinement, through the network's last step, then also to the model's parameters; a search without refinement has
+    none.
 
-    The network was trained on rotations up to 45° about each axis; beyond them it is not to be relied on.
+    The network was trained on whole shapes turned by up to 45° about each axis: beyond that, and for scans that overlap
+    in part, let ``search`` look among all poses.
 
     Args:
       source: (N, 3) real numbers, any unit. NumPy arrays of float64 or integers are centred before they become float32,
@@ -118,7 +127,9 @@ def register(
       source_mask: (N,) bool, False for padding; None when every point is real.
       target_mask: (M,) bool.
       model: the network; the packaged one by default (``load_model``).
-      refine: how to refine; None returns the network's estimate. Static under jit.
+      refine: how to refine; None returns the network's estimate, or the search's. Static under jit.
+      search: how to look for the pose among all poses (``Search()``); "auto" does so only where the plain result has
+        not converged, and always under jit and vmap, where that can't be seen; None never does. Static under jit.
       inlier_distance: the distance that defines ``fitness`` and ``rmse``, in the input's units; by default 1.5 times
         the coarser cloud's spacing.
 
@@ -136,6 +147,8 @@ def register(
         raise ValueError(f"model: expected a Model, as load_model gives, got {model!r:.80}")
     if not (refine is None or isinstance(refine, ICP)):
         raise ValueError(f"refine: expected an ICP or None, got {refine!r:.80}")
+    if not (search is None or search == "auto" or isinstance(search, Search)):
+        raise ValueError(f"search: expected a Search, 'auto' or None, got {search!r:.80}")
     if np.ndim(inlier_distance) != 0:  # type: ignore[arg-type]
         raise ValueError(f"inlier_distance: expected one number, got shape {np.shape(inlier_distance)}")  # type: ignore[arg-type]
     known = inlier_distance is not None and not isinstance(inlier_distance, Tracer)
@@ -144,7 +157,10 @@ def register(
     model = load_model() if model is None else model
     source, source_origin = _near_origin(source, source_mask, "source")
     target, target_origin = _near_origin(target, target_mask, "target")
-    result = _register(source, target, source_mask, target_mask, model, refine, inlier_distance)
+    first = None if search == "auto" else search
+    result = _register(source, target, source_mask, target_mask, model, refine, first, inlier_distance)
+    if search == "auto" and (isinstance(result.converged, Tracer) or not bool(result.converged)):
+        result = _register(source, target, source_mask, target_mask, model, refine, Search(), inlier_distance)
     return _restore_origins(result, source_origin, target_origin)
 
 
@@ -180,7 +196,7 @@ def _restore_origins(result: Registration, source: np.ndarray | None, target: np
     )
 
 
-@functools.partial(jax.jit, static_argnames="refine")
+@functools.partial(jax.jit, static_argnames=("refine", "search"))
 def _register(
     source_points: Array,
     target_points: Array,
@@ -188,15 +204,19 @@ def _register(
     target_mask: Array | None,
     model: Model,
     refine: ICP | None,
+    search: Search | None,
     inlier_distance: Array | None,
 ) -> Registration:
     raw_source, raw_target = make_cloud(source_points, source_mask), make_cloud(target_points, target_mask)
     source, target, frame = normalize_pair(raw_source, raw_target)
     answer = estimate_subsampled(model, source, target)
+    start, trusted = answer.transform, None
+    if search is not None:
+        start, _, trusted = find_pose(model, source, target, search, start)
     if refine is None:
-        transform, settled, steps = answer.transform, jnp.array(True), jnp.array(0)
+        transform, settled, steps = start, jnp.array(True), jnp.array(0)
     else:
-        transform, settled, steps = icp(source, target, answer.transform, refine)
+        transform, settled, steps = icp(source, target, start, refine, reach=trusted)
 
     touching = _REACH_SPACINGS * jnp.maximum(_coarser_spacing(source, target), 1e-6)
     reach = touching if inlier_distance is None else jnp.asarray(inlier_distance) / frame.scale
@@ -204,7 +224,15 @@ def _register(
     fitness, rmse = inlier_share(source.mask, distances, reach)
     some = thin(target, _CONTACT_POINTS)
     back = nearest(rigid.apply(rigid.inverse(transform), some.points), source).squared
-    contact = jnp.maximum(inlier_share(source.mask, distances, touching)[0], inlier_share(some.mask, back, touching)[0])
+    forth_share, back_share = (
+        inlier_share(source.mask, distances, touching)[0],
+        inlier_share(some.mask, back, touching)[0],
+    )
+    fits = jnp.maximum(forth_share, back_share) >= _LEAST_CONTACT
+    if search is not None:
+        near = inlier_share(source.mask, distances, 4 * touching)[0] + inlier_share(some.mask, back, 4 * touching)[0]
+        tight = forth_share + back_share >= _LEAST_TIGHTNESS * near
+        fits |= (jnp.maximum(forth_share, back_share) >= _LEAST_SEARCHED_CONTACT) & tight
     usable = well_posed(source) & well_posed(target) & jnp.all(jnp.isfinite(transform.translation))
     seen = rigid.apply(answer.seen, source.points)
     return Registration(
@@ -213,7 +241,7 @@ def _register(
         fitness=fitness,
         rmse=rmse * frame.scale,
         inlier_distance=reach * frame.scale,
-        converged=usable & settled & (contact >= _LEAST_CONTACT),
+        converged=usable & settled & fits,
         source_regions=jnp.where(source.mask, point_regions(model, seen, answer.source), 0),
         target_regions=jnp.where(target.mask, point_regions(model, target.points, answer.target), 0),
         coarse=Rigid(

@@ -1,10 +1,11 @@
-"""Speed on the CPU, in one run: the network alone, `register` batched, single and large, and Open3D's ICP beside it.
+"""Speed on the CPU, in one run: the network alone, `register` batched, single and large, peers, and the command line.
 
     python experiments/benchmarks/speed.py [--data PATH] [--pairs 256]
 
 Pairs follow the clean DCP protocol, 1,024 points, on the test split of PATH (procedural shapes by default). Each figure
-is taken after a warm-up that compiles: the median of the repeats, for Open3D the mean over the pairs, for the large
-pairs one run. Open3D is optional: `pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
+is taken after a warm-up that compiles: the median of the repeats, for peers the mean over the pairs, for the large
+pairs one run. The command line is timed as whole processes on two files of 40,000 points: the first run compiles. Peers
+are optional: `pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
 """
 
 import argparse
@@ -12,6 +13,9 @@ import json
 import os
 import platform
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,12 +30,14 @@ from urrt_jax import load_model, model_card, register
 from urrt_jax.data import demo_shape, find_data, load_shapes
 from urrt_jax.evaluation import PROTOCOLS, pose_errors, summarize
 from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax.io import write_cloud
 from urrt_jax.model.network import predict
+from urrt_jax.peers import PEERS
 
 HERE = Path(__file__).parent
 BATCH = 64
 LARGE = (80_000, 400_000)
-OPEN3D_RADIUS, OPEN3D_ITERATIONS = 0.5, 50
+PEERS_TIMED = ("icp", "gicp", "fgr", "fgr_icp")
 
 
 def seconds(function: Callable[[], object], repeats: int) -> float:
@@ -44,27 +50,35 @@ def seconds(function: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def open3d_icp(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Open3D's point-to-point ICP, started at the centroids; the matrix (4, 4)."""
-    import open3d  # pyright: ignore[reportMissingImports] - an optional peer
+def command_line_seconds() -> dict[str, float]:
+    """Whole-process times of the first `urrt register`, which compiles, of the second, and of `--help`."""
+    with tempfile.TemporaryDirectory() as folder:
+        cloud = demo_shape(80_000)
+        files = [str(Path(folder) / name) for name in ("source.ply", "target.ply")]
+        for file, points in zip(files, (cloud[::2], cloud[1::2]), strict=True):
+            write_cloud(file, points)
+        environment = {k: v for k, v in os.environ.items() if k != "URRT_NO_CACHE"} | {"XDG_CACHE_HOME": folder}
 
-    clouds = []
-    for points in (source, target):
-        cloud = open3d.geometry.PointCloud()
-        cloud.points = open3d.utility.Vector3dVector(points)
-        clouds.append(cloud)
-    start = np.eye(4)
-    start[:3, 3] = target.mean(axis=0) - source.mean(axis=0)
-    method = open3d.pipelines.registration
-    criteria = method.ICPConvergenceCriteria(max_iteration=OPEN3D_ITERATIONS)
-    estimation = method.TransformationEstimationPointToPoint()
-    return method.registration_icp(*clouds, OPEN3D_RADIUS, start, estimation, criteria).transformation
+        def whole_process(*arguments: str) -> float:
+            start = time.perf_counter()
+            command = [sys.executable, "-m", "urrt_jax.cli", *arguments]
+            subprocess.run(command, env=environment, check=True, capture_output=True)
+            return round(time.perf_counter() - start, 2)
+
+        pair = ("register", *files, "--json")
+        return {
+            "first": whole_process(*pair),
+            "second": whole_process(*pair),
+            "help": whole_process("register", "--help"),
+        }
 
 
 def measure(data: str, pairs: int, repeats: int) -> dict:
     shapes = load_shapes(data, split="test", points=1024, limit=pairs)
     trials = [PROTOCOLS["dcp"](shapes.points, item) for item in range(len(shapes))]
-    sources, targets, rotations, translations = (np.stack(values) for values in zip(*trials, strict=True))
+    sources, targets, rotations, translations = (
+        np.stack(values) for values in zip(*(trial[:4] for trial in trials), strict=True)
+    )
     model = load_model()
 
     network = jax.jit(jax.vmap(lambda a, b: predict(model, make_cloud(a), make_cloud(b))))
@@ -102,20 +116,22 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
         took = seconds(lambda pair=pair: jax.block_until_ready(register(pair[0], pair[1])), 1)
         rows.append(row(f"register, one pair of {size // 2:,} points", took, None))
 
-    try:
-        import open3d  # pyright: ignore[reportMissingImports] - an optional peer
-    except ImportError as error:
-        rows.append({"method": f"Open3D ICP: not measured ({error}); pip install 'urrt-jax[peers]'"})
-    else:
+    for name in PEERS_TIMED:
+        peer = PEERS[name]
+        try:
+            versions = peer.versions()
+        except ImportError as error:
+            rows.append({"method": f"{peer.title}: not measured, {error}"})
+            continue
         single, matrices = [], []
-        for item in tqdm(range(count), desc="Open3D ICP"):
+        for item in tqdm(range(count), desc=peer.title):
             start = time.perf_counter()
-            matrices.append(open3d_icp(sources[item].astype(np.float64), targets[item].astype(np.float64)))
+            matrices.append(peer.align_pair(sources[item].astype(np.float64), targets[item].astype(np.float64)))
             single.append(time.perf_counter() - start)
         stacked = np.stack(matrices)
         errors = pose_errors(stacked[:, :3, :3], stacked[:, :3, 3], rotations[:count], translations[:count])
-        name = f"Open3D {open3d.__version__} ICP from the centroids, one pair a call"
-        rows.append(row(name, statistics.mean(single), summarize(errors)["recall_1deg"]))
+        title = f"{peer.title} {' '.join(versions.values())}, one pair a call"
+        rows.append(row(title, statistics.mean(single), summarize(errors)["recall_1deg"]))
     return {
         "command": "python experiments/benchmarks/speed.py "
         f"--data {Path(data).name} --pairs {pairs} --repeats {repeats}",
@@ -127,6 +143,7 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
         "device": str(jax.devices()[0].platform),
         "jax": jax.__version__,
         "model_sha256": model_card()["sha256"],
+        "command_line_seconds": command_line_seconds(),
         "rows": rows,
     }
 

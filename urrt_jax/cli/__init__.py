@@ -1,4 +1,4 @@
-"""The command ``urrt``: register two files, a demonstration, training, evaluation.
+"""The command ``urrt``: register two files, a demonstration, training, evaluation, the paper's tables.
 
 One module a subcommand: a frozen dataclass whose fields are its flags and whose ``run`` does the work. JAX is imported
 inside ``run``, so that ``--help`` answers at once.
@@ -16,14 +16,15 @@ import tyro
 from urrt_jax.cli.demo import Demo
 from urrt_jax.cli.evaluate import Evaluate
 from urrt_jax.cli.register import Register
+from urrt_jax.cli.reproduce import Reproduce
 from urrt_jax.cli.train import Train
 
-_COMMANDS = {"register": Register, "demo": Demo, "train": Train, "evaluate": Evaluate}
+_COMMANDS = {"register": Register, "demo": Demo, "train": Train, "evaluate": Evaluate, "reproduce": Reproduce}
 _DESCRIPTION = """Rigid registration of 3D point clouds: the rotation R and translation t with target = R @ source + t.
 
 Environment variables:
 
-URRT_DATA      the data for train and evaluate, where --data is not given
+URRT_DATA      the data for train, evaluate and reproduce, where --data is not given
 
 URRT_NO_CACHE  if set, compiled programs are not kept in the user's cache folder
 

@@ -1,4 +1,4 @@
-"""``urrt evaluate``: a model's errors over a data set."""
+"""``urrt evaluate``: the errors of one or more methods over a data set."""
 
 import json
 import shlex
@@ -9,84 +9,104 @@ from typing import Any, Literal
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Measure a model's errors over the shapes of a data set, before and after refinement.
+    """Measure the errors of registration methods over the shapes of a data set.
+
+    Beside --out, in the folder 'items', a .npz for every method keeps the values of every item; the same command
+    continues a run that was stopped (remove the folder after changing code). An item on which a method fails is scored
+    as the identity and listed.
 
     Attributes:
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, else
-            'procedural'.
+            'procedural'. For the protocol 'scans' a .npz with names, pose_to_world and pts_<name>.
         split: Which half of the data.
-        protocol: How pairs are made; 'dcp': the clean pairs of Deep Closest Point.
-        model: Name of a packaged model, or a file written by 'urrt train'.
-        limit: At most so many shapes.
+        protocol: How pairs are made: dcp, prnet, prnet_noise, rpmnet (needs --points 2048), incomplete,
+            incomplete_both, drift, drift_target, outliers, independent, independent_noise, scans. Options follow the
+            name, as in 'outliers share=0.2'.
+        methods: network and register are ours, alone and refined; identity and principal_axes need nothing; icp,
+            icp_identity, icp_plane, gicp, fgr, fgr_icp, ransac, kiss need 'urrt-jax[peers]'.
+        model: Ours: name of a packaged model, or a file written by 'urrt train'.
+        limit: At most so many items, evenly spread.
         points: Points of each shape.
-        batch: Pairs at once.
-        no_refine: Measure the network alone, without ICP.
+        batch: Pairs at once, for ours.
         out: Where to write the results.
     """
 
     data: str | None = None
     split: Literal["train", "test"] = "test"
     protocol: str = "dcp"
+    methods: tuple[str, ...] = ("network", "register")
     model: str = "modelnet40"
     limit: int | None = None
     points: int = 1024
     batch: int = 64
-    no_refine: bool = False
     out: Path = Path("results.json")
 
     def run(self) -> int:
-        """Evaluates, prints the summary and writes it."""
+        """Evaluates, prints the figures and writes them."""
         import jax
 
-        from urrt_jax import __version__, load_model, model_card
+        from urrt_jax import __version__, model_card
         from urrt_jax.atomic import write_atomically
         from urrt_jax.cli.printing import changed_flags, print_skipped
         from urrt_jax.data import find_data, load_shapes
-        from urrt_jax.evaluation import PROTOCOLS, evaluate
-        from urrt_jax.refine import ICP
+        from urrt_jax.evaluation import evaluate, find_method, find_protocol, load_scan_pairs, spread, values_path
 
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol: expected one of {sorted(PROTOCOLS)}, got {self.protocol!r}")
-        model, source = load_model(self.model), find_data(self.data)
-        shapes = load_shapes(source, split=self.split, points=self.points, limit=self.limit, progress=True)
-        print_skipped(shapes.skipped)
-        evaluation = evaluate(
-            model,
-            shapes.points,
-            protocol=self.protocol,
-            refine=None if self.no_refine else ICP(),
-            batch=self.batch,
-        )
-        summary = evaluation.summary()
+        # Everything that may be mistyped is looked at before any work.
+        find_protocol(self.protocol)
+        methods = {name: find_method(name, model=self.model) for name in self.methods}
+        if not methods:
+            raise ValueError("methods: name at least one")
+        spread(1, self.limit)
+        for method in methods.values():
+            method.identity()
+        card, source = model_card(self.model), find_data(self.data)
+        if self.protocol.split()[0] == "scans":
+            pairs, _ = load_scan_pairs(source)
+        else:
+            shapes = load_shapes(source, split=self.split, points=self.points, progress=True)
+            print_skipped(shapes.skipped)
+            pairs = shapes.points
+        items = spread(len(pairs), self.limit)
+
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        figures, failures = {}, {}
+        for name, method in methods.items():
+            save = values_path(self.out.parent / "items", name, method, self.protocol, pairs, items)
+            save.parent.mkdir(exist_ok=True)
+            batch = self.batch if method.batch > 1 else None
+            found = evaluate(method, self.protocol, pairs, items=items, save=save, batch=batch)
+            figures[name] = found.summary()
+            failures[name] = {str(item): reason for item, reason in found.failures.items()}
         # Names only: a results file is for other people, too.
         settings = {
-            "model": Path(self.model).name,
-            "model_sha256": model_card(self.model)["sha256"],
+            "command": shlex.join(["urrt", "evaluate", *changed_flags(self)]),
             "versions": {"urrt_jax": __version__, "jax": jax.__version__},
             "device": jax.devices()[0].platform,
-            "command": shlex.join(["urrt", "evaluate", *changed_flags(self)]),
+            "model": Path(self.model).name,
+            "model_sha256": card["sha256"],
             "data": Path(source).name,
             "split": self.split,
             "points": self.points,
-            "refine": not self.no_refine,
+            "protocol": self.protocol,
+            "items": len(items),
+            "seed": "the number of each item",
         }
-        print(figures_table(summary))
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.out, json.dumps(settings | summary, indent=2) + "\n")
-        print(f"wrote {self.out}")
+        print(figures_table(figures))
+        write_atomically(
+            self.out, json.dumps(settings | {"figures": figures, "failed_items": failures}, indent=2) + "\n"
+        )
+        print(f"wrote {self.out}, and the values of every item to {self.out.parent / 'items'}")
         return 0
 
 
-def figures_table(summary: dict[str, Any]) -> str:
-    """The figures of a summary: a row a figure, a column for each of its groups, then what stands alone."""
-    groups = {name: figures for name, figures in summary.items() if isinstance(figures, dict)}
-    rows = list(dict.fromkeys(row for figures in groups.values() for row in figures))
-    lines = [" " * 20 + "".join(f"{name:>12}" for name in groups)]
-    for row in rows:
-        lines.append(f"{row:<20}" + "".join(f"{figures.get(row, float('nan')):>12.5g}" for figures in groups.values()))
-    lines += [f"{name:<20}{_short(value):>12}" for name, value in summary.items() if name not in groups]
+def figures_table(figures: dict[str, dict[str, Any]]) -> str:
+    """The figures as text: a row a figure, a column a method."""
+    rows = list(dict.fromkeys(row for each in figures.values() for row in each))
+    width = max(map(len, rows)) + 2
+    lines = [" " * width + "".join(f"{name:>16}" for name in figures)]
+    lines += [f"{row:<{width}}" + "".join(f"{_short(each.get(row)):>16}" for each in figures.values()) for row in rows]
     return "\n".join(lines)
 
 
 def _short(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    return "" if value is None else f"{value:.5g}"

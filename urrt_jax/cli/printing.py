@@ -60,5 +60,9 @@ def changed_flags(flags: Any, prefix: str = "") -> list[str]:
         elif value is True:
             typed.append(f"--{name}")
         elif value != field.default:
-            typed += [f"--{name}", Path(value).name if name in ("out", "data") else str(value)]
+            values = value if isinstance(value, tuple) else (value,)
+            typed += [
+                f"--{name}",
+                *(Path(each).name if name in ("out", "data", "model") else str(each) for each in values),
+            ]
     return typed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_format
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -21,7 +22,9 @@ class Register:
         json: Print one JSON object: matrix, rotation, translation, fitness, rmse, converged.
         out: Write the moved source here, as .ply (coloured by region), .xyz or .npy.
         picture: Write a picture of before and after here (.png, .pdf or .svg).
-        no_refine: Keep the network's own estimate, without ICP.
+        search: Look among all poses, whatever the rotation and with partial overlap: 'auto' where the plain result has
+            not converged.
+        no_refine: Keep the network's own estimate, without search and ICP.
         model: Name of a packaged model, or a file written by 'urrt train'.
         inlier_distance: What counts as touching in fitness and rmse, in the clouds' unit; by default 1.5 times the
             spacing of the sparser cloud.
@@ -33,6 +36,7 @@ class Register:
     json: bool = False
     out: Path | None = None
     picture: Path | None = None
+    search: Literal["auto", "always", "never"] = "auto"
     no_refine: bool = False
     model: str = "modelnet40"
     inlier_distance: float | None = None
@@ -40,7 +44,7 @@ class Register:
 
     def run(self) -> int:
         """Registers, prints, and writes what was asked for."""
-        from urrt_jax import load_model, register
+        from urrt_jax import Search, load_model, register
         from urrt_jax.cli.printing import as_dict, as_table
         from urrt_jax.io import read_cloud, write_cloud
         from urrt_jax.refine import ICP
@@ -55,6 +59,7 @@ class Register:
             target,
             model=load_model(self.model),
             refine=None if self.no_refine else ICP(),
+            search=None if self.no_refine else {"auto": "auto", "always": Search(), "never": None}[self.search],
             inlier_distance=self.inlier_distance,
         )
         if self.out is not None:

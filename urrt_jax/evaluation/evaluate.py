@@ -1,124 +1,310 @@
-"""Evaluation of a model over a data set: jitted, batched, with the values of every item kept."""
+"""Evaluation of a method over a protocol, with the values of every item kept, saved and resumed."""
 
 import dataclasses
+import hashlib
+import json
+import time
+import zipfile
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from tqdm import tqdm
 
-from urrt_jax.evaluation.metrics import pose_errors, summarize
-from urrt_jax.evaluation.protocols import PROTOCOLS, Trial
-from urrt_jax.model import Model
-from urrt_jax.refine import ICP
-from urrt_jax.registration import register
+from urrt_jax.atomic import write_atomically
+from urrt_jax.evaluation.methods import Method, Poses, find_method
+from urrt_jax.evaluation.metrics import clean_chamfer, pose_errors, summarize, true_overlap
+from urrt_jax.evaluation.protocols import Trial, find_protocol
+from urrt_jax.geometry.rigid import Rigid
+
+_SAVE_EVERY = 20.0  # seconds
+_OVERLAP_REACH = 0.1  # scales
+_ROTATION_TOLERANCE = 1e-3  # of the entries of R Rᵀ
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """The poses found for every item, before and after refinement, and the truth.
+    """The poses a method found for every item, and the truth: every figure and curve can be made from it.
 
     Attributes:
-      protocol: its name.
-      refined: whether the network's estimates were refined.
+      method: its title.
+      protocol: its name, with its options.
       items: (B,) int, the items evaluated.
-      rotations, translations: (B, 3, 3) and (B, 3), as ``register`` returned them.
-      coarse_rotations, coarse_translations: the network's own.
+      rotations, translations: (B, 3, 3) and (B, 3), float64; the identity where the method failed.
       true_rotations, true_translations: the truth.
-      fitness, rmse: (B,).
-      converged: (B,) bool.
+      scales: (B,), what recalls compare translations with; 1 for shapes.
+      fitness, converged: (B,), what the method says of its result; NaN where it says nothing.
+      chamfer: (B,), RPM-Net's clean Chamfer distance; NaN where the clean shape is not known.
+      overlap: (B,), the share of source points with a target point within a tenth of the scale, in the true pose.
+      seconds: (B,), a pair's share of the time of its batch, without the loading; the first batch compiles.
+      failures: item → what went wrong, for each that raised or gave values that are not finite.
+      identity: everything the poses depend on, by name.
     """
 
+    method: str
     protocol: str
-    refined: bool
     items: np.ndarray
     rotations: np.ndarray
     translations: np.ndarray
-    coarse_rotations: np.ndarray
-    coarse_translations: np.ndarray
     true_rotations: np.ndarray
     true_translations: np.ndarray
+    scales: np.ndarray
     fitness: np.ndarray
-    rmse: np.ndarray
     converged: np.ndarray
+    chamfer: np.ndarray
+    overlap: np.ndarray
+    seconds: np.ndarray
+    failures: dict[int, str]
+    identity: dict[str, Any]
 
-    def errors(self, *, coarse: bool = False) -> dict[str, np.ndarray]:
-        """``pose_errors`` of every item, after refinement or (``coarse``) of the network alone."""
-        found = (self.coarse_rotations, self.coarse_translations) if coarse else (self.rotations, self.translations)
-        return pose_errors(*found, self.true_rotations, self.true_translations)
+    def __len__(self) -> int:
+        """The number of items."""
+        return len(self.items)
+
+    def take(self, rows: np.ndarray) -> "Evaluation":
+        """The evaluation of some of its rows, (K,) int or (B,) bool."""
+        values = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        kept = set(values["items"].tolist())
+        failures = {item: reason for item, reason in self.failures.items() if item in kept}
+        return dataclasses.replace(self, **values, failures=failures)
+
+    def errors(self) -> dict[str, np.ndarray]:
+        """``pose_errors`` of every item."""
+        return pose_errors(self.rotations, self.translations, self.true_rotations, self.true_translations)
 
     def summary(self) -> dict[str, Any]:
-        """The figures of the network alone and after refinement, as plain numbers."""
-        refined = {"refined": summarize(self.errors())} if self.refined else {}
+        """The figures over all items, as plain numbers; None where a method or protocol gives none."""
+        errors = self.errors()
+        wrong = (self.converged > 0) & (errors["angle"] > 5.0)
+        known = bool(np.any(np.isfinite(self.converged)))
         return {
-            "protocol": self.protocol,
-            "items": len(self.items),
-            "network": summarize(self.errors(coarse=True)),
-            **refined,
-            "converged": float(np.mean(self.converged)),
-            "converged_but_off_by_5deg": float(np.mean(self.converged & (self.errors()["angle"] > 5.0))),
-            "fitness_mean": float(np.mean(self.fitness)),
+            **summarize(errors, self.scales),
+            "chamfer_mean": _mean(self.chamfer),
+            "fitness_mean": _mean(self.fitness),
+            "converged": float(np.mean(self.converged > 0)) if known else None,
+            "converged_but_off_by_5deg": float(np.mean(wrong)) if known else None,
+            "failures": len(self.failures),
         }
+
+    def save(self, path: str | Path) -> None:
+        """Writes every value to a ``.npz``, which ``load_evaluation`` reads."""
+        described = {
+            "method": self.method,
+            "protocol": self.protocol,
+            "failures": {str(item): reason for item, reason in self.failures.items()},
+            "identity": self.identity,
+        }
+        content = BytesIO()
+        np.savez_compressed(content, **{name: getattr(self, name) for name in _ARRAYS}, described=json.dumps(described))
+        write_atomically(path, content.getvalue())
+
+
+_ARRAYS = tuple(field.name for field in dataclasses.fields(Evaluation) if field.type is np.ndarray)
+
+
+def load_evaluation(path: str | Path) -> Evaluation:
+    """What ``Evaluation.save`` wrote.
+
+    Raises:
+      ValueError: the file holds something else, or is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            described = json.loads(str(archive["described"]))
+            values = {name: archive[name] for name in _ARRAYS}
+    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{path}: holds no evaluation ({error})") from error
+    failures = {int(item): reason for item, reason in described.pop("failures").items()}
+    return Evaluation(**values, **described, failures=failures)
 
 
 def evaluate(
-    model: Model,
-    clouds: np.ndarray,
+    method: Any,
+    protocol: str,
+    data: Any,
     *,
-    protocol: str = "dcp",
-    refine: ICP | None = ICP(),
     items: np.ndarray | None = None,
-    batch: int = 64,
+    save: str | Path | None = None,
+    batch: int | None = None,
     progress: bool = True,
 ) -> Evaluation:
-    """The evaluation of ``model`` with ``register`` over all items.
+    """The evaluation of a method over the items of a protocol.
+
+    Our methods run in jitted batches, others pair by pair. An item on which the method raises, or gives values that are
+    not finite, is scored as the identity and listed in ``failures``. With ``save`` the values are kept in a ``.npz``
+    all along, also when the run is interrupted, and the same call continues after the last item there.
 
     Args:
-      model: to evaluate.
-      clouds: (S, P, 3) shapes in the unit sphere; item i is shape i.
-      protocol: a name in ``PROTOCOLS``.
-      refine: passed to ``register``.
+      method: a name (``"register"``, ``"network"``, one in ``PEERS``), a ``Model``, or a function from a source (N, 3)
+        and a target (M, 3) to the matrix (4, 4) of the pose.
+      protocol: a name in ``PROTOCOLS``, with options: ``"drift sigma=0.02"``.
+      data: (S, P, 3) shapes in the unit sphere, item i being shape i; for ``"scans"``, the trials of
+        ``load_scan_pairs``.
       items: which items; all by default.
-      batch: pairs at once.
+      save: a ``.npz`` to keep the values in.
+      batch: pairs at once; the method's own by default.
       progress: whether a progress bar is shown.
 
     Raises:
-      ValueError: an unknown protocol, or no items.
+      ValueError: an unknown method or protocol, no items, items out of range, or ``save`` holds another evaluation.
+      ImportError: the method needs a library that is not installed; the message says how to install it.
     """
-    if protocol not in PROTOCOLS:
-        raise ValueError(f"protocol: expected one of {sorted(PROTOCOLS)}, got {protocol!r}")
-    chosen = np.arange(len(clouds)) if items is None else np.asarray(items)
+    method, make = find_method(method), find_protocol(protocol)
+    if protocol.split()[0] != "scans" and not (isinstance(data, np.ndarray) and data.ndim == 3 and data.shape[2] == 3):
+        raise ValueError(
+            f"data: expected an array (S, P, 3) of shapes, got {getattr(data, 'shape', type(data).__name__)}"
+        )
+    chosen = np.arange(len(data)) if items is None else np.asarray(items)
     if len(chosen) == 0:
         raise ValueError("items: there is nothing to evaluate")
-    if batch < 1:
+    if chosen.min() < 0 or chosen.max() >= len(data):
+        raise ValueError(f"items: expected indices in 0..{len(data) - 1}, got {chosen.min()}..{chosen.max()}")
+    if batch is not None and batch < 1:
         raise ValueError(f"batch: expected at least 1, got {batch}")
-    batch = min(batch, len(chosen))
+    # As JSON has it, so that what is read back compares equal.
+    identity = json.loads(json.dumps(method.identity() | {"protocol": protocol, "data": data_digest(data)}))
 
-    @jax.jit
-    def align(source: jax.Array, target: jax.Array) -> dict[str, jax.Array]:
-        result = jax.vmap(lambda a, b: register(a, b, model=model, refine=refine))(source, target)
-        return {
-            "rotations": result.rotation,
-            "translations": result.translation,
-            "coarse_rotations": result.coarse.rotation,
-            "coarse_translations": result.coarse.translation,
-            "fitness": result.fitness,
-            "rmse": result.rmse,
-            "converged": result.converged,
-        }
+    parts, done = [], 0
+    if save is not None and Path(save).exists():
+        before = load_evaluation(save)
+        if before.identity != identity or not np.array_equal(before.items, chosen[: len(before)]):
+            raise ValueError(f"{save}: holds another evaluation; remove it or choose another name")
+        parts, done = [before], len(before)
 
-    found: list[dict[str, np.ndarray]] = []
-    with tqdm(total=len(chosen), unit="pair", disable=not progress) as bar:
-        for start in range(0, len(chosen), batch):
-            part = chosen[start : start + batch]
-            # The last batch is filled up with its own first item, so that one compiled program serves all.
-            filled = np.concatenate([part, np.full(batch - len(part), part[0])])
-            trials = [PROTOCOLS[protocol](clouds, int(item), points=clouds.shape[1]) for item in filled]
-            stacked = Trial(*(np.stack(values) for values in zip(*trials, strict=True)))
-            output = jax.device_get(align(jnp.asarray(stacked.source), jnp.asarray(stacked.target)))
-            output |= {"true_rotations": stacked.rotation, "true_translations": stacked.translation}
-            found.append({name: values[: len(part)] for name, values in output.items()})
-            bar.update(len(part))
-    joined = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    return Evaluation(protocol=protocol, refined=refine is not None, items=chosen, **joined)
+    size = min(method.batch if batch is None else batch, len(chosen))
+    saved = time.monotonic()
+    try:
+        with tqdm(total=len(chosen), initial=done, unit="pair", desc=method.title, disable=not progress) as bar:
+            while done < len(chosen):
+                part = chosen[done : done + size]
+                parts.append(_evaluate_part(method, protocol, identity, part, size, make, data))
+                done += len(part)
+                bar.update(len(part))
+                if save is not None and time.monotonic() - saved > _SAVE_EVERY:
+                    parts = [_join(parts)]
+                    parts[0].save(save)
+                    saved = time.monotonic()
+    finally:
+        if save is not None and parts:
+            _join(parts).save(save)
+    return _join(parts)
+
+
+def values_path(folder: Path, name: str, method: Method, protocol: str, data: Any, items: np.ndarray) -> Path:
+    """A file for the values of an evaluation, named by the method, the protocol and a digest of all they depend on."""
+    described = json.dumps([method.identity(), protocol, data_digest(data), items.tolist()], sort_keys=True)
+    digest = hashlib.sha256(described.encode()).hexdigest()[:10]
+    return folder / f"{protocol.replace(' ', '_')}-{name}-{digest}.npz"
+
+
+def spread(count: int, limit: int | None, stride: int = 1) -> np.ndarray:
+    """At most ``limit`` of so many items, evenly spread: every k-th from the first, k at least ``stride``."""
+    if limit is not None and limit < 1:
+        raise ValueError(f"limit: expected at least 1, got {limit}")
+    return np.arange(0, count, stride if limit is None else max(stride, -(-count // limit)))
+
+
+def data_digest(data: Any) -> str:
+    """A short digest of the values of shapes (S, P, 3) or scans, so that results are never mixed up."""
+    state = hashlib.sha256()
+    for each in [data] if isinstance(data, np.ndarray) else [array for trial in data for array in trial[:4]]:
+        state.update(np.ascontiguousarray(each).tobytes())
+    return state.hexdigest()[:16]
+
+
+def _evaluate_part(
+    method: Method, protocol: str, identity: dict, part: np.ndarray, size: int, make: Any, data: Any
+) -> Evaluation:
+    trials = [make(data, int(item)) for item in part]
+    # The last batch is filled up with its own first item, so that one compiled program serves all.
+    filled = trials + [trials[0]] * (size - len(trials))
+    start = time.perf_counter()
+    poses, failures = _align(method, filled, [int(item) for item in part])
+    seconds = (time.perf_counter() - start) / len(part)
+    chamfer, overlap = _compare(filled, poses)
+    count = len(part)
+    return Evaluation(
+        method=method.title,
+        protocol=protocol,
+        items=part,
+        rotations=poses.rotation[:count],
+        translations=poses.translation[:count],
+        true_rotations=np.stack([trial.rotation for trial in trials]),
+        true_translations=np.stack([trial.translation for trial in trials]),
+        scales=np.array([trial.scale for trial in trials]),
+        fitness=poses.fitness[:count],
+        converged=poses.converged[:count],
+        chamfer=chamfer[:count],
+        overlap=overlap[:count],
+        seconds=np.full(count, seconds),
+        failures=failures,
+        identity=identity,
+    )
+
+
+def _align(method: Method, trials: Sequence[Trial], items: Sequence[int]) -> tuple[Poses, dict[int, str]]:
+    """The poses of all trials, the identity where there is none, and the failures of those that have an item."""
+    poses, reasons = _try(method, trials)
+    rotation, translation = np.array(poses.rotation, np.float64), np.array(poses.translation, np.float64)
+    finite = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1))
+    rotation[~finite] = 0.0
+    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    broken = np.logical_not(finite & (off < _ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0))
+    rotation[broken], translation[broken] = np.eye(3), 0.0
+    failures = {
+        item: reasons.get(row, "no rotation" if finite[row] else "values that are not finite")
+        for row, item in enumerate(items)
+        if broken[row]
+    }
+    said = (np.array(value, np.float64) for value in (poses.fitness, poses.converged))
+    return Poses(rotation, translation, *said), failures
+
+
+def _try(method: Method, trials: Sequence[Trial]) -> tuple[Poses, dict[int, str]]:
+    """The poses, NaN where the method raised, and why, by row; a batch that raises is tried again one by one."""
+    try:
+        return method.align([trial.source for trial in trials], [trial.target for trial in trials]), {}
+    except Exception as error:  # a method may raise anything; it is counted, not hidden
+        if len(trials) == 1:
+            nothing = np.full(1, np.nan)
+            poses = Poses(np.full((1, 3, 3), np.nan), np.full((1, 3), np.nan), nothing, nothing)
+            return poses, {0: f"{type(error).__name__}: {error}"}
+    singles = [_try(method, [trial]) for trial in trials]
+    poses = Poses(*(np.concatenate(values) for values in zip(*(pose for pose, _ in singles), strict=True)))
+    return poses, {row: reasons[0] for row, (_, reasons) in enumerate(singles) if reasons}
+
+
+def _compare(trials: Sequence[Trial], poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Clean Chamfer distances, NaN where there is no clean shape, and overlaps."""
+    first = trials[0]
+    if first.clean is None:
+        # Scans: their overlap is known to the protocol, and their sizes differ.
+        return np.full(len(trials), np.nan), np.full(len(trials), np.nan)
+    fields = zip(*(trial[:5] for trial in trials), strict=True)
+    source, target, rotation, translation, clean = (jnp.asarray(np.stack(field), jnp.float32) for field in fields)
+    found = Rigid(jnp.asarray(poses.rotation, jnp.float32), jnp.asarray(poses.translation, jnp.float32))
+    chamfer, overlap = _compare_all(source, target, clean, found, Rigid(rotation, translation))
+    return np.asarray(chamfer, np.float64), np.asarray(overlap, np.float64)
+
+
+@jax.jit
+@jax.vmap
+def _compare_all(source: Array, target: Array, clean: Array, found: Rigid, truth: Rigid) -> tuple[Array, Array]:
+    return clean_chamfer(source, target, clean, found, truth), true_overlap(source, target, truth, _OVERLAP_REACH)
+
+
+def _join(parts: Sequence[Evaluation]) -> Evaluation:
+    values = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    failures = {item: reason for part in parts for item, reason in part.failures.items()}
+    return dataclasses.replace(parts[0], **values, failures=failures)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    """The mean of the values that are there (a failure gives none), or None."""
+    known = values[np.isfinite(values)]
+    return float(np.mean(known)) if len(known) else None

@@ -1,13 +1,24 @@
-"""How far a pose is from the truth: DCP's errors of Euler angles, and isotropic ones.
+"""How far a pose is from the truth: DCP's errors of Euler angles, isotropic ones, recalls and clean Chamfer distances.
 
-Host-side NumPy in float64, batched: these are counted once, on results.
+Host-side NumPy in float64, batched: these are counted once, on results. Chamfer distances are JAX functions of a pair.
 """
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax.geometry.neighbors import nearest
+from urrt_jax.geometry.rigid import Rigid
+
+RECALLS = ((1.0, 0.05), (2.0, 0.02), (5.0, 0.05), (5.0, 0.1))
+"""Recall counts a pose whose angle is below so many degrees and whose distance is below so many scales."""
 
 
 def euler_angles(rotations: np.ndarray) -> np.ndarray:
@@ -31,24 +42,53 @@ def pose_errors(
       translations, true_translations: (B, 3).
 
     Returns:
-      ``euler`` (B, 3), the differences of Euler angles in degrees, each in [-180, 180); ``offset`` (B, 3), of the
-      translations; ``angle`` (B,), the angle of R_trueᵀ R in degrees; ``distance`` (B,), ‖t‖ of T_true⁻¹ T.
+      ``euler`` (B, 3), the differences of Euler angles in degrees, as DCP counts them: not wrapped at half a turn;
+      ``offset`` (B, 3), of the translations; ``angle`` (B,), the angle of R_trueᵀ R in degrees; ``distance`` (B,),
+      ‖t‖ of T_true⁻¹ T.
     """
     rotations, true_rotations = np.asarray(rotations, np.float64), np.asarray(true_rotations, np.float64)
     offset = np.asarray(translations, np.float64) - np.asarray(true_translations, np.float64)
-    euler = euler_angles(rotations) - euler_angles(true_rotations)
     return {
-        "euler": (euler + 180.0) % 360.0 - 180.0,
+        "euler": euler_angles(rotations) - euler_angles(true_rotations),
         "offset": offset,
         "angle": rotation_degrees(rotations, true_rotations),
         "distance": np.linalg.norm(offset, axis=-1),
     }
 
 
-def summarize(errors: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The usual figures of ``pose_errors``: DCP's over items and axes, isotropic ones, and recalls."""
+def clean_chamfer(source: Array, target: Array, clean: Array, found: Rigid, truth: Rigid) -> Array:
+    """RPM-Net's modified Chamfer distance, (), squared: each cloud against the whole shape without noise.
+
+    The mean squared distance of the moved source (N, 3) to ``clean`` (P, 3), given in the target's frame, plus that of
+    the target (M, 3) to the clean shape as the found pose moves it from the source's frame (Yew and Lee 2020, eq. 10).
+    """
+    moved = rigid.apply(rigid.compose(found, rigid.inverse(truth)), clean)
+    forth = nearest(rigid.apply(found, source), make_cloud(clean)).squared
+    back = nearest(target, make_cloud(moved)).squared
+    return jnp.mean(forth) + jnp.mean(back)
+
+
+def true_overlap(source: Array, target: Array, truth: Rigid, reach: Array | float) -> Array:
+    """The share of source points (N, 3) that have a target point (M, 3) within ``reach`` in the true pose, ()."""
+    return jnp.mean(
+        nearest(rigid.apply(truth, source), make_cloud(target)).squared < jax.lax.square(jnp.asarray(reach))
+    )
+
+
+def summarize(errors: dict[str, np.ndarray], scales: ArrayLike = 1.0) -> dict[str, Any]:
+    """The usual figures of ``pose_errors``: DCP's over items and axes, isotropic ones, and recalls.
+
+    Args:
+      errors: of B poses.
+      scales: () or (B,), the length that recalls compare the distance with.
+    """
     euler, offset, angle, distance = (errors[name] for name in ("euler", "offset", "angle", "distance"))
     mse_rotation, mse_translation = float(np.mean(euler**2)), float(np.mean(offset**2))
+    relative = distance / np.asarray(scales)
+    recalls = {
+        f"recall_{degrees:g}deg_{share:g}": float(np.mean((angle < degrees) & (relative < share)))
+        for degrees, share in RECALLS
+    }
     return {
         "items": len(angle),
         "mse_rotation": mse_rotation,
@@ -61,7 +101,13 @@ def summarize(errors: dict[str, np.ndarray]) -> dict[str, Any]:
         "angle_median": float(np.median(angle)),
         "angle_p95": float(np.percentile(angle, 95)),
         "distance_mean": float(np.mean(distance)),
+        "distance_median": float(np.median(distance)),
+        "distance_p95": float(np.percentile(distance, 95)),
         "recall_1deg": float(np.mean(angle < 1.0)),
-        "recall_1deg_0.05": float(np.mean((angle < 1.0) & (distance < 0.05))),
-        "recall_5deg_0.1": float(np.mean((angle < 5.0) & (distance < 0.1))),
+        **recalls,
     }
+
+
+def recall_curve(angles: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """The share of angles (B,) below each threshold (T,), in degrees; (T,)."""
+    return np.searchsorted(np.sort(angles), thresholds, side="left") / len(angles)

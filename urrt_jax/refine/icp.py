@@ -73,7 +73,7 @@ class _Progress(NamedTuple):
     iteration: Array
 
 
-def icp(source: Cloud, target: Cloud, initial: Rigid, config: ICP = ICP()) -> Refinement:
+def icp(source: Cloud, target: Cloud, initial: Rigid, config: ICP = ICP(), *, reach: Array | None = None) -> Refinement:
     """The refined transform from source to target, starting at ``initial``, of clouds in units of their radius.
 
     Point-to-point, from the source's points to their nearest target points. Stage one works on small even subsamples
@@ -87,10 +87,27 @@ def icp(source: Cloud, target: Cloud, initial: Rigid, config: ICP = ICP()) -> Re
       target: M points.
       initial: rough transform.
       config: how to refine.
+      reach: the distance within which ``initial`` can be trusted, where it is known: the first stage is then left out.
     """
     fixed: tuple[Cloud, Cloud, Rigid] = jax.tree.map(jax.lax.stop_gradient, (source, target, initial))
-    transform, reach = _find_basin(*fixed, config) if config.coarse_points else (fixed[2], jnp.array(config.reach))
+    transform = fixed[2]
+    if reach is None:
+        transform, reach = _find_basin(*fixed, config) if config.coarse_points else (transform, jnp.array(config.reach))
     return _settle(thin(source, config.points), target, transform, reach, config)
+
+
+def refine_from(
+    source: Cloud,
+    target: Cloud,
+    initial: Rigid,
+    reach: Array,
+    floor: Array,
+    *,
+    iterations: int,
+    tolerance: float = 1e-3,
+) -> Rigid:
+    """A few steps of robust ICP about ``initial``: weights (1 + d²/r²)⁻² with r falling from ``reach`` to ``floor``."""
+    return _iterate(source, target, initial, reach, floor, _geman_mcclure, iterations, tolerance).transform
 
 
 def _find_basin(source: Cloud, target: Cloud, initial: Rigid, config: ICP) -> tuple[Rigid, Array]:
@@ -98,11 +115,8 @@ def _find_basin(source: Cloud, target: Cloud, initial: Rigid, config: ICP) -> tu
     source, target = subsample(source, config.coarse_points), subsample(target, 2 * config.coarse_points)
     floor = jnp.maximum(spacing(target), _LEAST_SPACING)
 
-    def weigh(squared: Array, reach: Array) -> Array:
-        return (1 + squared / reach**2) ** -2
-
     reach = jnp.maximum(config.reach, floor)
-    end = _iterate(source, target, initial, reach, floor, weigh, config.coarse_iterations, config.tolerance)
+    end = _iterate(source, target, initial, reach, floor, _geman_mcclure, config.coarse_iterations, config.tolerance)
     return end.transform, end.reach
 
 
@@ -121,6 +135,10 @@ def _settle(source: Cloud, target: Cloud, initial: Rigid, reach: Array, config: 
     paired = jnp.sum(weights) >= 3
     transform = jax.tree.map(lambda new, old: jnp.where(paired, new, old), last, end.transform)
     return Refinement(transform, end.settled & paired, end.iteration)
+
+
+def _geman_mcclure(squared: Array, reach: Array) -> Array:
+    return (1 + squared / reach**2) ** -2
 
 
 def _correspond(source: Cloud, target: Cloud, transform: Rigid, reach: Array, weigh: Weigh) -> tuple[Array, Array]:

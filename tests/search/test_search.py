@@ -1,0 +1,288 @@
+"""Search: poses of any angle at partial overlap, what the answer is invariant to, and what it does when there is none.
+
+Most tests share one compiled program: clouds are padded to one size.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from urrt_jax import register
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import make_cloud, normalize_pair
+from urrt_jax.search import Found, Search, search
+
+_SMALL = Search(points=128, rotations=0, matches=16, kept=4)
+_SIZE = 220
+_AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
+_SHIFT = np.array([0.4, -0.2, 0.7])
+
+
+def _turn(degrees: float) -> np.ndarray:
+    return Rotation.from_rotvec(np.deg2rad(degrees) * _AXIS).as_matrix()
+
+
+def _degrees(first, second) -> float:
+    turn = np.asarray(first, np.float64).T @ np.asarray(second, np.float64)
+    return float(np.rad2deg(Rotation.from_matrix(turn).magnitude()))
+
+
+def _pad(points: np.ndarray, rows: np.ndarray | None = None):
+    """Points and mask of ``_SIZE`` rows, the points at the given ones."""
+    rows = np.arange(len(points)) if rows is None else rows
+    padded, mask = np.zeros((_SIZE, 3), np.float32), np.zeros(_SIZE, bool)
+    padded[rows], mask[rows] = points, True
+    return padded, mask
+
+
+def _search(model, config, source, target) -> Found:
+    pair = normalize_pair(make_cloud(*source), make_cloud(*target))
+    return search(model, pair[0], pair[1], config, rigid.identity())
+
+
+_jitted = jax.jit(_search, static_argnums=1)
+
+
+@pytest.fixture(scope="module")
+def find(small_model):
+    """A function of two clouds (and a configuration), padded here: what the search finds."""
+
+    def find_small(source, target, config=_SMALL) -> Found:
+        source, target = (cloud if isinstance(cloud, tuple) else _pad(cloud) for cloud in (source, target))
+        return _jitted(small_model, config, source, target)
+
+    return find_small
+
+
+@pytest.fixture(scope="module")
+def partial(cloud):
+    """A function of degrees: two clouds that lack another quarter each, the second one turned and moved."""
+    source = cloud[np.argsort(cloud[:, 0])[len(cloud) // 4 :]]
+    rest = cloud[np.argsort(cloud[:, 1])[: 3 * len(cloud) // 4]]
+    return lambda degrees: (source, (rest @ _turn(degrees).T + _SHIFT).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def found(find, partial) -> Found:
+    return find(*partial(120))
+
+
+def _same(result: Found, expected: Found, atol: float = 1e-4) -> None:
+    for leaf, other in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(leaf, other, atol=atol)
+
+
+@pytest.mark.parametrize("degrees", [0, 60, 120, 180])
+def test_finds_any_turn_at_partial_overlap(find, partial, degrees):
+    assert _degrees(find(*partial(degrees)).transform.rotation, _turn(degrees)) < 3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_finds_any_turn_of_another_sample_of_the_shape(find, make_cloud_points, seed):
+    """No point has an exact counterpart."""
+    source, rotation = make_cloud_points(1), Rotation.random(random_state=seed).as_matrix()
+    target = (make_cloud_points(2) @ rotation.T + _SHIFT).astype(np.float32)
+    assert _degrees(find(source, target).transform.rotation, rotation) < 12
+
+
+def test_score_of_the_cloud_itself_is_one(find, cloud):
+    # Both clouds are sampled alike, whatever the pose.
+    assert float(find(cloud, (cloud @ _turn(100).T).astype(np.float32)).score) == pytest.approx(1, abs=1e-3)
+
+
+def test_score_of_a_partial_overlap_is_between_zero_and_one(found):
+    assert 0.5 < float(found.score) < 0.95
+
+
+def test_score_of_another_shape_is_lower(find, cloud):
+    box = np.random.default_rng(0).uniform(-1, 1, cloud.shape).astype(np.float32)
+    assert float(find(cloud, box).score) < 0.8
+
+
+def test_swapping_the_clouds_inverts_the_transform(find, partial, found):
+    back = find(*reversed(partial(120)))
+    assert _degrees(rigid.inverse(back.transform).rotation, found.transform.rotation) < 3
+
+
+def test_swapping_the_clouds_keeps_the_score(find, partial, found):
+    back = find(*reversed(partial(120)))
+    assert float(back.score) == pytest.approx(float(found.score), abs=0.03)
+
+
+def test_swapping_the_clouds_keeps_the_reach(find, partial, found):
+    back = find(*reversed(partial(120)))
+    assert float(back.reach) == pytest.approx(float(found.reach), rel=1e-5)
+
+
+def test_turning_the_target_turns_the_answer(find, partial, found):
+    source, target = partial(120)
+    turn = Rotation.from_rotvec([1.0, 0.5, -2.0]).as_matrix()
+    turned = find(source, (target @ turn.T).astype(np.float32))
+    assert _degrees(turned.transform.rotation, turn @ np.asarray(found.transform.rotation, np.float64)) < 0.5
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
+def test_the_unit_does_not_matter(find, partial, found, scale):
+    source, target = partial(120)
+    _same(find(source * np.float32(scale), target * np.float32(scale)), found, atol=1e-3)
+
+
+def test_is_the_same_every_time(find, partial, found):
+    again = find(*partial(120))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True))
+
+
+def test_order_of_points_does_not_matter(find, partial, found):
+    rng = np.random.default_rng(0)
+    _same(find(*(rng.permutation(cloud) for cloud in partial(120))), found, atol=1e-3)
+
+
+def test_place_of_padding_does_not_matter(find, partial, found):
+    rng = np.random.default_rng(0)
+    padded = (_pad(cloud, rng.permutation(_SIZE)[: len(cloud)]) for cloud in partial(120))
+    _same(find(*padded), found, atol=1e-3)
+
+
+def test_padding_does_not_matter(small_model, partial, found):
+    bare = ((cloud, np.ones(len(cloud), bool)) for cloud in partial(120))
+    _same(_jitted(small_model, _SMALL, *bare), found, atol=1e-3)
+
+
+def test_non_finite_padding_does_not_matter(find, partial, found):
+    padded = [_pad(cloud) for cloud in partial(120)]
+    _same(find(*((np.where(mask[:, None], points, np.nan), mask) for points, mask in padded)), found)
+
+
+def test_vmap_agrees_with_a_loop(small_model, find, partial):
+    pairs = [[_pad(cloud) for cloud in partial(degrees)] for degrees in (60, 180)]
+    source, target = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+    together = jax.jit(jax.vmap(functools.partial(_search, small_model, _SMALL)))(source, target)
+    for i, pair in enumerate(pairs):
+        _same(jax.tree.map(lambda leaf, i=i: leaf[i], together), find(*pair), atol=1e-3)
+
+
+def test_max_angle_excludes_a_half_turn(find, cloud):
+    target = (cloud @ _turn(180).T).astype(np.float32)
+    bound = Search(points=128, rotations=0, matches=16, kept=4, max_angle=90)
+    assert _degrees(find(cloud, target, bound).transform.rotation, np.eye(3)) <= 90.01
+
+
+def test_without_matches_the_network_alone_gives_a_rigid_answer(find, partial):
+    answer = find(*partial(60), Search(points=64, rotations=24, matches=0, kept=4))
+    _assert_rigid(answer)
+
+
+def _assert_rigid(answer: Found) -> None:
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(answer))
+    np.testing.assert_allclose(answer.transform.rotation @ answer.transform.rotation.T, np.eye(3), atol=1e-4)
+    assert 0 <= float(answer.score) <= 1
+
+
+_LINE = np.outer(np.linspace(-1, 1, 60), _AXIS)
+
+
+@pytest.mark.parametrize(
+    "degenerate",
+    [
+        pytest.param(_LINE, id="a line"),
+        pytest.param(np.ones((60, 3)), id="coincident"),
+        pytest.param(np.ones((1, 3)), id="one point"),
+        pytest.param(np.eye(3)[:2], id="two points"),
+        pytest.param(np.eye(3), id="three points"),
+        pytest.param(np.zeros((0, 3)), id="empty"),
+        pytest.param(_LINE * [1, 1, 0] + np.random.default_rng(0).normal(size=(60, 3)) * [1, 1, 0], id="a plane"),
+    ],
+)
+@pytest.mark.parametrize("against", ["itself", "a cloud"])
+def test_answer_for_a_degenerate_cloud_is_rigid(find, cloud, degenerate, against):
+    _assert_rigid(find(degenerate, degenerate if against == "itself" else cloud))
+
+
+def test_a_stray_point_does_not_matter(find, partial):
+    source, target = partial(120)
+    source = np.concatenate([source, [[6, 5, -4]]]).astype(np.float32)
+    assert _degrees(find(source, target).transform.rotation, _turn(120)) < 3
+
+
+@pytest.mark.parametrize("name", ["points", "support", "kept"])
+def test_too_few_are_refused_by_name(name):
+    with pytest.raises(ValueError, match=f"^{name}: expected at least .*, got 0$"):
+        Search(**{name: 0})
+
+
+def test_negative_matches_are_refused():
+    with pytest.raises(ValueError, match=r"^matches: expected at least 0, got -1"):
+        Search(matches=-1)
+
+
+@pytest.mark.parametrize("rotations", [-1, 2, 23, 48])
+def test_rotations_without_a_cover_are_refused(rotations):
+    with pytest.raises(ValueError, match=f"^rotations: expected 0, 1, 24 or 60, got {rotations}"):
+        Search(rotations=rotations)
+
+
+def test_a_search_without_hypotheses_is_refused():
+    with pytest.raises(ValueError, match=r"^matches and rotations: "):
+        Search(matches=0, rotations=0)
+
+
+@pytest.mark.parametrize("name", ["normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance"])
+@pytest.mark.parametrize("length", [0.0, -1.0, float("nan")])
+def test_lengths_that_are_not_positive_are_refused_by_name(name, length):
+    with pytest.raises(ValueError, match=f"^{name}: expected a positive number, got {length}"):
+        Search(**{name: length})
+
+
+@pytest.fixture(scope="module")
+def half_turned(cloud) -> np.ndarray:
+    """The cloud turned by 150 degrees and moved."""
+    return (cloud @ _turn(150).T + _SHIFT).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def searched(small_model, cloud, half_turned):
+    return register(cloud, half_turned, model=small_model, search=_SMALL)
+
+
+def test_register_with_search_recovers_a_turn_by_150_degrees(searched):
+    assert _degrees(searched.rotation, _turn(150)) < 1
+
+
+def test_register_with_search_recovers_the_translation(searched):
+    np.testing.assert_allclose(searched.translation, _SHIFT, atol=1e-3)
+
+
+def test_register_with_search_converges(searched):
+    assert bool(searched.converged)
+
+
+def test_register_without_search_does_not_recover_a_turn_by_150_degrees(small_model, cloud, half_turned):
+    """Otherwise the tests of search here would test nothing."""
+    assert _degrees(register(cloud, half_turned, model=small_model).rotation, _turn(150)) > 20
+
+
+def test_register_with_search_still_reports_the_network_s_estimate(small_model, cloud, half_turned, searched):
+    plain = register(cloud, half_turned, model=small_model)
+    np.testing.assert_allclose(searched.coarse.rotation, plain.coarse.rotation, atol=1e-5)
+
+
+def test_register_without_refinement_returns_the_search_s_pose(small_model, cloud, half_turned):
+    alone = register(cloud, half_turned, model=small_model, search=_SMALL, refine=None)
+    assert _degrees(alone.rotation, _turn(150)) < 3
+
+
+def test_register_with_automatic_search_leaves_a_converged_result_alone(small_model, cloud, pose):
+    target = (cloud @ pose[0].T + pose[1]).astype(np.float32)
+    plain = register(cloud, target, model=small_model)
+    found = register(cloud, target, model=small_model, search="auto")
+    np.testing.assert_array_equal(found.matrix, plain.matrix)
+
+
+@pytest.mark.parametrize("wrong", [3, True, "always", Search, {"points": 128}])
+def test_register_refuses_what_is_no_search(small_model, cloud, wrong):
+    with pytest.raises(ValueError, match=r"^search: expected a Search"):
+        register(cloud, cloud, model=small_model, search=wrong)

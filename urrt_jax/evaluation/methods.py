@@ -1,0 +1,197 @@
+"""What can be evaluated: our network, alone and refined, in batches; peers and plain functions, pair by pair."""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from urrt_jax.geometry.clouds import pad_clouds
+from urrt_jax.model import Model
+from urrt_jax.peers import PEERS, Peer
+from urrt_jax.refine import ICP
+from urrt_jax.registration import register
+from urrt_jax.search import Search
+from urrt_jax.weights import load_model
+
+_LARGE = 4096  # clouds beyond this are padded to whole blocks, so that few programs are compiled for scans
+_BLOCK = 16_384
+# How each of ours refines, searches, and how many pairs it takes at once.
+_OURS: dict[str, tuple[ICP | None, Search | None, int]] = {
+    "network": (None, None, 64),
+    "register": (ICP(), None, 64),
+    "search": (ICP(), Search(max_angle=90.0), 8),
+    "search_all": (ICP(), Search(), 1),
+}
+
+
+class Poses(NamedTuple):
+    """The answers for B pairs: (B, 3, 3), (B, 3), and what the method says of them, NaN where it says nothing."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    fitness: np.ndarray
+    converged: np.ndarray
+
+
+class Method(Protocol):
+    """A registration method as ``evaluate`` runs it."""
+
+    @property
+    def title(self) -> str:
+        """How tables call it."""
+        ...
+
+    @property
+    def batch(self) -> int:
+        """How many pairs of equal size it takes at once."""
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """Everything that its answers depend on, for results files; ImportError where its library is missing."""
+        ...
+
+    def align(self, sources: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Poses:
+        """The poses of B pairs of clouds (N, 3) and (M, 3)."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ours:
+    """``register`` with a model, refined or the network alone.
+
+    Attributes:
+      model: the network.
+      refine: as for ``register``.
+      search: as for ``register``.
+      name: of the model, for titles.
+      batch: pairs at once.
+    """
+
+    model: Model
+    refine: ICP | None = ICP()
+    search: Search | None = None
+    name: str = "model"
+    batch: int = 64
+
+    @property
+    def title(self) -> str:
+        stages = "network alone" if self.refine is None else "refined"
+        return f"ours, {'searched and ' if self.search else ''}{stages} ({self.name})"
+
+    def identity(self) -> dict[str, Any]:
+        return {
+            "method": "register",
+            "parameters_sha256": _digest(self.model),
+            "config": dataclasses.asdict(self.model.config),
+            "refine": None if self.refine is None else dataclasses.asdict(self.refine),
+            "search": None if self.search is None else dataclasses.asdict(self.search),
+        }
+
+    def align(self, sources: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Poses:
+        found = _register_all(self.model, *_stack(sources), *_stack(targets), self.refine, self.search)
+        return Poses(*(np.asarray(value) for value in jax.device_get(found)))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PairByPair:
+    """A function of one pair as a method.
+
+    Attributes:
+      function: from a source (N, 3) and a target (M, 3), float64, to the matrix (4, 4) of the pose.
+      title: how tables call it.
+      settings: what its answers depend on.
+      peer: where it is one of ``PEERS``, it.
+    """
+
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    title: str
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    peer: Peer | None = None
+
+    @property
+    def batch(self) -> int:
+        return 1
+
+    def identity(self) -> dict[str, Any]:
+        """Its title and settings, and the versions of a peer's libraries."""
+        versions = {} if self.peer is None else {"versions": self.peer.versions()}
+        return {"method": self.title, "settings": self.settings} | versions
+
+    def align(self, sources: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Poses:
+        pairs = zip(sources, targets, strict=True)
+        found = np.stack(
+            [self.function(source.astype(np.float64), target.astype(np.float64)) for source, target in pairs]
+        )
+        unknown = np.full(len(found), np.nan)
+        return Poses(found[:, :3, :3], found[:, :3, 3], unknown, unknown)
+
+
+def find_method(method: "str | Method | Model | Peer | Callable", *, model: str | Path = "modelnet40") -> Method:
+    """The method of a name, a model, or a function of one pair that returns the (4, 4) matrix of the pose.
+
+    Args:
+      method: ``"network"``, ``"register"`` and ``"search"`` are ours: alone, refined, and refined after a global search
+        over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans); the
+        others are the names in ``PEERS``.
+      model: what ours uses: a packaged name or a file.
+
+    Raises:
+      ValueError: there is no such method or model.
+    """
+    if isinstance(method, Model):
+        return Ours(model=method)
+    if isinstance(method, Peer):
+        return PairByPair(function=method.align_pair, title=method.title, settings=method.settings, peer=method)
+    if isinstance(method, str) and method in _OURS:
+        refine, search, batch = _OURS[method]
+        return Ours(model=load_model(model), refine=refine, search=search, name=Path(model).stem, batch=batch)
+    if isinstance(method, str):
+        if method not in PEERS:
+            raise ValueError(f"method: expected one of {', '.join((*_OURS, *PEERS))}, got {method!r}")
+        return find_method(PEERS[method])
+    if hasattr(method, "align"):
+        return method  # type: ignore[return-value]
+    if not callable(method):
+        raise ValueError(f"method: expected a name, a Model, a peer or a function, got {method!r:.80}")
+    name = getattr(method, "__name__", "function")
+    return PairByPair(function=method, title=name, settings={"function": getattr(method, "__qualname__", name)})
+
+
+@functools.partial(jax.jit, static_argnames=("refine", "search"))
+def _register_all(
+    model: Model,
+    sources: Array,
+    source_masks: Array,
+    targets: Array,
+    target_masks: Array,
+    refine: ICP | None,
+    search: Search | None,
+) -> tuple[Array, ...]:
+    def one(source: Array, source_mask: Array, target: Array, target_mask: Array) -> tuple[Array, ...]:
+        masks = {"source_mask": source_mask, "target_mask": target_mask}
+        result = register(source, target, **masks, model=model, refine=refine, search=search)
+        return result.rotation, result.translation, result.fitness, result.converged.astype(jnp.float32)
+
+    return jax.vmap(one)(sources, source_masks, targets, target_masks)
+
+
+def _stack(clouds: Sequence[np.ndarray]) -> tuple[Array, Array]:
+    """Clouds as one array (B, N, 3) and their masks (B, N)."""
+    size = max(map(len, clouds))
+    if size > _LARGE:
+        size = -(-size // _BLOCK) * _BLOCK
+    return pad_clouds(clouds, size=size)
+
+
+def _digest(model: Model) -> str:
+    state = hashlib.sha256()
+    for leaf in jax.tree.leaves(model.params):
+        state.update(np.ascontiguousarray(leaf).tobytes())
+    return state.hexdigest()

@@ -1,0 +1,123 @@
+"""Peers that iterate from a start: ICP of Open3D, point to point and point to plane, and GICP of small_gicp."""
+
+import dataclasses
+from importlib.metadata import version
+from typing import Any, Literal
+
+import numpy as np
+
+from urrt_jax.peers.peer import Peer, centroid_start, require
+
+
+def open3d_cloud(points: np.ndarray, normal_radius: float | None = None, neighbors: int = 30) -> Any:
+    """Open3D's cloud of points (N, 3), with normals from the neighbours within a radius where one is given."""
+    open3d = require("open3d")
+    cloud = open3d.geometry.PointCloud()
+    cloud.points = open3d.utility.Vector3dVector(np.asarray(points, np.float64))
+    if normal_radius is not None:
+        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(radius=normal_radius, max_nn=neighbors))
+    return cloud
+
+
+def open3d_icp(
+    source: Any, target: Any, reach: float, start: np.ndarray, iterations: int, *, plane: bool
+) -> np.ndarray:
+    """The matrix (4, 4) of Open3D's ICP, which stops early where neither fitness nor rmse change by 1e-6."""
+    method = require("open3d").pipelines.registration
+    estimation = (
+        method.TransformationEstimationPointToPlane() if plane else method.TransformationEstimationPointToPoint()
+    )
+    criteria = method.ICPConvergenceCriteria(max_iteration=iterations)
+    return np.asarray(method.registration_icp(source, target, reach, start, estimation, criteria).transformation)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Open3DICP(Peer):
+    """Point-to-point ICP (Besl and McKay 1992), Open3D's.
+
+    Attributes:
+      start: from the given positions, or from the centroids laid on each other.
+      reach: the largest distance of a correspondence.
+      iterations: at most so many.
+    """
+
+    start: Literal["identity", "centroids"] = "centroids"
+    reach: float = 0.5
+    iterations: int = 200
+
+    @property
+    def title(self) -> str:
+        return f"ICP from the {self.start} (Open3D)"
+
+    def versions(self) -> dict[str, str]:
+        return {"open3d": require("open3d").__version__}
+
+    def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        start = np.eye(4) if self.start == "identity" else centroid_start(source, target)
+        clouds = open3d_cloud(source), open3d_cloud(target)
+        return open3d_icp(*clouds, self.reach, start, self.iterations, plane=False)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointToPlaneICP(Peer):
+    """Point-to-plane ICP (Chen and Medioni 1991) from the centroids, Open3D's.
+
+    Attributes:
+      reach: the largest distance of a correspondence.
+      iterations: at most so many.
+      normal_radius: normals of the target come from the neighbours within it, at most 30.
+    """
+
+    reach: float = 0.2
+    iterations: int = 200
+    normal_radius: float = 0.15
+
+    @property
+    def title(self) -> str:
+        return "point-to-plane ICP (Open3D)"
+
+    def versions(self) -> dict[str, str]:
+        return {"open3d": require("open3d").__version__}
+
+    def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        clouds = open3d_cloud(source), open3d_cloud(target, self.normal_radius)
+        return open3d_icp(*clouds, self.reach, centroid_start(source, target), self.iterations, plane=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GICP(Peer):
+    """Generalised ICP (Segal et al. 2009) from the centroids, of small_gicp.
+
+    Attributes:
+      reach: the largest distance of a correspondence.
+      iterations: at most so many.
+      neighbors: points that a covariance is estimated from.
+    """
+
+    reach: float = 0.2
+    iterations: int = 200
+    neighbors: int = 20
+
+    @property
+    def title(self) -> str:
+        return "GICP (small_gicp)"
+
+    def versions(self) -> dict[str, str]:
+        require("small_gicp")
+        return {"small_gicp": version("small_gicp")}
+
+    def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        gicp = require("small_gicp")
+        clouds = []
+        for points in (target, source):
+            cloud = gicp.PointCloud(np.asarray(points, np.float64))
+            tree = gicp.KdTree(cloud)
+            gicp.estimate_covariances(cloud, tree, num_neighbors=self.neighbors)
+            clouds.append((cloud, tree))
+        (goal, tree), (moved, _) = clouds
+        found = gicp.align(
+            goal, moved, tree, init_T_target_source=centroid_start(source, target), registration_type="GICP",
+            max_correspondence_distance=self.reach, max_iterations=self.iterations,
+            rotation_epsilon=1e-5, translation_epsilon=1e-6,
+        )  # fmt: skip
+        return np.asarray(found.T_target_source)

@@ -1,0 +1,51 @@
+"""How to search."""
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Search:
+    """How to look for the pose among all poses. Lengths are in spacings of the subsample, so that units do not matter.
+
+    Attributes:
+      points: points of each cloud that are looked at.
+      normal_radius: of the neighbourhood of a normal.
+      feature_radius: of the neighbourhood of a feature.
+      match_distance: two matches agree when the lengths between their ends differ by less than this, and a match
+        agrees with a pose that brings its ends closer than this.
+      matches: hypotheses from matched features, at most; 0 for none.
+      support: matches that a hypothesis is made of, besides its first.
+      rotations: members of the cover of SO(3) at which the network is asked: 0, 1 (the clouds as they are), 24 or 60.
+      max_angle: hypotheses that turn by more, in degrees, are not considered: shapes that are nearly symmetric often
+        fit as well when turned around, and who knows better should say so.
+      kept: hypotheses that are refined on the subsample.
+      inlier_distance: beyond it a point counts as unmatched when poses are compared.
+    """
+
+    points: int = 1024
+    normal_radius: float = 2.0
+    feature_radius: float = 5.0
+    match_distance: float = 1.5
+    matches: int = 64
+    support: int = 16
+    rotations: int = 24
+    max_angle: float = 180.0
+    kept: int = 16
+    inlier_distance: float = 1.5
+
+    def __post_init__(self) -> None:
+        for name in ("points", "matches", "support", "rotations", "kept"):
+            if type(getattr(self, name)) is not int:
+                raise ValueError(f"{name}: expected a whole number, got {getattr(self, name)!r}")
+        for name, least in (("points", 16), ("matches", 0), ("support", 3), ("kept", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        if self.rotations not in (0, 1, 24, 60):
+            raise ValueError(f"rotations: expected 0, 1, 24 or 60, got {self.rotations}")
+        if not self.matches + self.rotations:
+            raise ValueError("matches and rotations: both are 0, which leaves no hypothesis")
+        for name in ("normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0 < value < math.inf):
+                raise ValueError(f"{name}: expected a positive number, got {value!r}")
