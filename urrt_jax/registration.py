@@ -34,7 +34,7 @@ _REACH_SPACINGS = 1.5
 _LEAST_CONTACT = 0.6
 # A searched pose may overlap by less, where points that come near mostly touch: surfaces that cross don't.
 _LEAST_SEARCHED_CONTACT = 0.3
-_LEAST_TIGHTNESS = 0.6
+_LEAST_TIGHTNESS, _NEAR = 0.6, 4.0
 _CONTACT_POINTS = 4096
 _LARGEST = 1e15
 
@@ -224,15 +224,16 @@ def _register(
     fitness, rmse = inlier_share(source.mask, distances, reach)
     some = thin(target, _CONTACT_POINTS)
     back = nearest(rigid.apply(rigid.inverse(transform), some.points), source).squared
-    forth_share, back_share = (
-        inlier_share(source.mask, distances, touching)[0],
-        inlier_share(some.mask, back, touching)[0],
-    )
-    fits = jnp.maximum(forth_share, back_share) >= _LEAST_CONTACT
+
+    def shares(within: Array) -> Array:
+        sides = (source.mask, distances), (some.mask, back)
+        return jnp.stack([inlier_share(mask, squared, within)[0] for mask, squared in sides])
+
+    contact = shares(touching)
+    fits = jnp.max(contact) >= _LEAST_CONTACT
     if search is not None:
-        near = inlier_share(source.mask, distances, 4 * touching)[0] + inlier_share(some.mask, back, 4 * touching)[0]
-        tight = forth_share + back_share >= _LEAST_TIGHTNESS * near
-        fits |= (jnp.maximum(forth_share, back_share) >= _LEAST_SEARCHED_CONTACT) & tight
+        tight = jnp.sum(contact) >= _LEAST_TIGHTNESS * jnp.sum(shares(_NEAR * touching))
+        fits |= (jnp.max(contact) >= _LEAST_SEARCHED_CONTACT) & tight
     usable = well_posed(source) & well_posed(target) & jnp.all(jnp.isfinite(transform.translation))
     seen = rigid.apply(answer.seen, source.points)
     return Registration(

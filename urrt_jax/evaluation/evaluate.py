@@ -169,12 +169,13 @@ def evaluate(
     # As JSON has it, so that what is read back compares equal.
     identity = json.loads(json.dumps(method.identity() | {"protocol": protocol, "data": data_digest(data)}))
 
-    parts, done = [], 0
+    parts, kept = [], 0
     if save is not None and Path(save).exists():
         before = load_evaluation(save)
         if before.identity != identity or not np.array_equal(before.items, chosen[: len(before)]):
             raise ValueError(f"{save}: holds another evaluation; remove it or choose another name")
-        parts, done = [before], len(before)
+        parts, kept = [before], len(before)
+    done = kept
 
     size = min(method.batch if batch is None else batch, len(chosen))
     saved = time.monotonic()
@@ -190,7 +191,7 @@ def evaluate(
                     parts[0].save(save)
                     saved = time.monotonic()
     finally:
-        if save is not None and parts:
+        if save is not None and done > kept:
             _join(parts).save(save)
     return _join(parts)
 

@@ -10,21 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from urrt_jax.peers.iterative import open3d_cloud
+from urrt_jax.peers.iterative import Open3DPeer, open3d_cloud
 from urrt_jax.peers.peer import Peer, matrix, require
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _OnFeatures(Peer):
+class _OnFeatures(Open3DPeer):
     """FPFH features (Rusu et al. 2009) of Open3D; normals and features from the neighbours within two radii."""
 
     normal_radius: float = 0.15
     feature_radius: float = 0.3
     normal_neighbors: int = 30
     feature_neighbors: int = 100
-
-    def versions(self) -> dict[str, str]:
-        return {"open3d": require("open3d").__version__}
 
     def _cloud_and_features(self, points: np.ndarray) -> tuple[Any, Any]:
         open3d = require("open3d")

@@ -32,7 +32,15 @@ def open3d_icp(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Open3DICP(Peer):
+class Open3DPeer(Peer):
+    """A peer that needs Open3D."""
+
+    def versions(self) -> dict[str, str]:
+        return {"open3d": require("open3d").__version__}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Open3DICP(Open3DPeer):
     """Point-to-point ICP (Besl and McKay 1992), Open3D's.
 
     Attributes:
@@ -49,9 +57,6 @@ class Open3DICP(Peer):
     def title(self) -> str:
         return f"ICP from the {self.start} (Open3D)"
 
-    def versions(self) -> dict[str, str]:
-        return {"open3d": require("open3d").__version__}
-
     def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         start = np.eye(4) if self.start == "identity" else centroid_start(source, target)
         clouds = open3d_cloud(source), open3d_cloud(target)
@@ -59,7 +64,7 @@ class Open3DICP(Peer):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PointToPlaneICP(Peer):
+class PointToPlaneICP(Open3DPeer):
     """Point-to-plane ICP (Chen and Medioni 1991) from the centroids, Open3D's.
 
     Attributes:
@@ -75,9 +80,6 @@ class PointToPlaneICP(Peer):
     @property
     def title(self) -> str:
         return "point-to-plane ICP (Open3D)"
-
-    def versions(self) -> dict[str, str]:
-        return {"open3d": require("open3d").__version__}
 
     def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         clouds = open3d_cloud(source), open3d_cloud(target, self.normal_radius)

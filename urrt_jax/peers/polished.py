@@ -4,12 +4,22 @@ import dataclasses
 
 import numpy as np
 
-from urrt_jax.peers.iterative import open3d_cloud, open3d_icp
-from urrt_jax.peers.peer import Peer, require
+from urrt_jax.peers.iterative import Open3DPeer, open3d_cloud, open3d_icp
+from urrt_jax.peers.peer import Peer
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Polished(Peer):
+class _Then(Open3DPeer):
+    """Another peer, and Open3D's ICP after it."""
+
+    peer: Peer
+
+    def versions(self) -> dict[str, str]:
+        return self.peer.versions() | super().versions()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Polished(_Then):
     """A peer whose answer Open3D's point-to-point ICP starts from.
 
     Attributes:
@@ -18,16 +28,12 @@ class Polished(Peer):
       iterations: at most so many.
     """
 
-    peer: Peer
     reach: float = 0.1
     iterations: int = 50
 
     @property
     def title(self) -> str:
         return self.peer.title.replace(" (", " + ICP (") if "(" in self.peer.title else f"{self.peer.title} + ICP"
-
-    def versions(self) -> dict[str, str]:
-        return self.peer.versions() | {"open3d": require("open3d").__version__}
 
     def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         start = self.peer.align_pair(source, target)
@@ -36,7 +42,7 @@ class Polished(Peer):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OnScans(Peer):
+class OnScans(_Then):
     """A peer on scans: brought to the unit sphere's size, thinned to voxels, then two rounds of point-to-plane ICP.
 
     Attributes:
@@ -45,16 +51,12 @@ class OnScans(Peer):
       polish: reaches of the rounds of ICP, in voxels.
     """
 
-    peer: Peer
     voxel: float = 0.03
     polish: tuple[float, ...] = (1.0, 0.4)
 
     @property
     def title(self) -> str:
         return f"{self.peer.title}, then point-to-plane ICP"
-
-    def versions(self) -> dict[str, str]:
-        return self.peer.versions() | {"open3d": require("open3d").__version__}
 
     def align_pair(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         # A bounding box of diagonal 2 has about the size of the unit sphere that the peers' lengths refer to.

@@ -11,8 +11,9 @@ from scipy.spatial import KDTree
 import urrt_jax
 from urrt_jax.atomic import write_atomically
 from urrt_jax.data import load_shapes
-from urrt_jax.evaluation import Trial, evaluate, find_method, find_protocol
+from urrt_jax.evaluation import Trial, evaluate, find_method, find_protocol, spread
 from urrt_jax.reproduce.experiment import Experiment
+from urrt_jax.reproduce.figures import check_drawing
 from urrt_jax.weights import model_card
 
 _TARGET, _OFF, _ON, _INK = "#aeb7c2", "#c0392b", "#2a67b0", "#2f3640"
@@ -40,13 +41,11 @@ def draw_pairs(
       ValueError: the data or the model can't be used.
       ImportError: Matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("pictures need Matplotlib: pip install 'urrt-jax[viz]'") from error
-    if limit is not None and limit < 1:
-        raise ValueError(f"limit: expected at least 1, got {limit}")
+    check_drawing()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    spread(1, limit)
     parts = experiment.parts[:limit]
     shapes = load_shapes(data, split="test", points=1024)
     columns = ["input", *experiment.methods]

@@ -67,9 +67,13 @@ def part_markdown(results: dict[str, Any], part: dict[str, Any]) -> str:
 
 def heading(column: str) -> str:
     """The name of a figure, as tables show it; ValueError for one that there is not."""
+    return _look_up(column)[0]
+
+
+def _look_up(column: str) -> tuple[str, str, bool]:
     if column.removeprefix("asymmetric.") not in _COLUMNS:
         raise ValueError(f"columns: expected some of {', '.join(_COLUMNS)}, got {column!r}")
-    return _COLUMNS[column.removeprefix("asymmetric.")][0]
+    return _COLUMNS[column.removeprefix("asymmetric.")]
 
 
 def _heading(column: str) -> str:
@@ -83,7 +87,7 @@ def _value(row: dict[str, Any], column: str) -> Any:
 
 def _best(rows: list[dict[str, Any]], column: str) -> str | None:
     """The best value of a column as it is printed; None where there is none or all are alike."""
-    _, style, less = _COLUMNS[column.removeprefix("asymmetric.")]
+    _, style, less = _look_up(column)
     values = [_value(row, column) for row in rows if "missing" not in row and _value(row, column) is not None]
     if len(values) < 2 or min(values) == max(values):
         return None
@@ -93,7 +97,7 @@ def _best(rows: list[dict[str, Any]], column: str) -> str | None:
 def _cell(value: Any, column: str, best: str | None) -> str:
     if value is None:
         return ""
-    text = format(value, _COLUMNS[column.removeprefix("asymmetric.")][1])
+    text = format(value, _look_up(column)[1])
     return f"**{text}**" if text == best else text
 
 
