@@ -70,19 +70,22 @@ def test_help_answers_without_importing_jax(command):
 def test_json_is_one_object_with_exactly_the_promised_keys(files, capsys):
     assert register(files, "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    assert list(found) == ["matrix", "rotation", "translation", "fitness", "rmse", "converged"]
+    promised = "matrix rotation translation fitness rmse overlap confidence converged information"
+    assert list(found) == promised.split()
     matrix = np.array(found["matrix"])
     np.testing.assert_array_equal(matrix[:3, :3], found["rotation"])
     np.testing.assert_array_equal(matrix[:3, 3], found["translation"])
     np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
     assert isinstance(found["fitness"], float) and isinstance(found["rmse"], float)
     assert isinstance(found["converged"], bool)
+    assert len(found["overlap"]) == 2 and np.shape(found["information"]) == (6, 6)
 
 
 def test_table_shows_the_transform_and_the_diagnostics(files, capsys):
     assert register(files) == 0
     out = capsys.readouterr().out
-    for word in ("a.ply, 200 points", "b.xyz, 200 points", "R, turns by", "fitness", "rmse", "converged"):
+    measures = ("fitness", "rmse", "overlap", "confidence", "converged")
+    for word in ("a.ply, 200 points", "b.xyz, 200 points", "R, turns by", *measures):
         assert word in out
 
 

@@ -280,10 +280,11 @@ def test_refined_pose_derivative_agrees_with_finite_differences(small_model, apa
     points = {"source": jnp.asarray(apart), "target": jnp.asarray(noisy, jnp.float32)}
     along = jnp.asarray(rng.normal(size=apart.shape), jnp.float32)
     weights = jnp.asarray(rng.normal(size=(3, 3) if part == "rotation" else 3), jnp.float32)
+    exact = ICP(plane=0.0, tolerance=3e-7)  # normals change when a neighbourhood does; tests/refine has them
 
     @jax.jit
     def value(step):
-        result = register(**(points | {moves: points[moves] + step * along}), model=small_model)
+        result = register(**(points | {moves: points[moves] + step * along}), model=small_model, refine=exact)
         return jnp.sum(getattr(result, part) * weights)
 
     step = 3e-3
@@ -496,9 +497,9 @@ _LARGE = """
         regions=4, width=16, encoder_widths=(16,), branch_width=8, position_widths=(8,), decoder_widths=(16,),
         steps=1, points=64))
     rng = np.random.default_rng(0)
-    points = rng.normal(size=(200_000, 3))
+    points = rng.normal(size=(1_000_000, 3))
     points *= np.array([1.0, 0.7, 0.4]) / np.linalg.norm(points, axis=1, keepdims=True)
-    points[:60_000] = 0.3 * points[:60_000] + [0.8, 0.5, 0.2]
+    points[:300_000] = 0.3 * points[:300_000] + [0.8, 0.5, 0.2]
     angle = 0.05
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     result = register(points.astype(np.float32), (points @ turn.T).astype(np.float32), model=model)
@@ -511,12 +512,12 @@ _LARGE = """
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak memory from Linux's /proc")
-def test_two_clouds_of_200_000_points_take_less_than_two_gibibytes():
+def test_two_clouds_of_a_million_points_take_less_than_three_gibibytes():
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(_LARGE)], capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert int(done.stdout) * 1024 < 2 * 2**30
+    assert int(done.stdout) * 1024 < 3 * 2**30
 
 
 @pytest.mark.parametrize("radii", [10.0, 100.0, 1000.0])

@@ -11,7 +11,7 @@ from urrt_jax.reproduce import as_markdown, find_experiment
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
 TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond")
-FILES = (*(f"{name}/results.json" for name in (*TABLES, "figure4_qualitative")), "benchmarks/speed.json")
+FILES = (*(f"{name}/results.json" for name in (*TABLES, "figure4_qualitative", "confidence")), "benchmarks/speed.json")
 README = (ROOT / "README.md").read_text()
 
 
@@ -73,6 +73,13 @@ def test_reference_rows_on_every_12th_item_are_those_of_others():
 def test_readme_shows_the_tables_that_were_written(name):
     for table in (EXPERIMENTS / name).read_text().strip().split("\n\n"):
         assert table in README
+
+
+def test_confidence_tells_right_poses_from_wrong_ones():
+    """On test shapes and scans, hard protocols, as they are, turned by any rotation, and searched."""
+    area = {row["pairs_of"]: row["auc"] for row in load("confidence")["rows"]}
+    assert area["all"] >= 0.95
+    assert area["real scans"] >= 0.95
 
 
 def test_readme_shows_the_training_command():

@@ -12,6 +12,7 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from urrt_jax.assessment import fit, information, inlier_share, moved_information, well_posed
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import (
     Cloud,
@@ -19,23 +20,16 @@ from urrt_jax.geometry.clouds import (
     denormalize_translation,
     make_cloud,
     normalize_pair,
-    thin,
+    subsample,
 )
-from urrt_jax.geometry.neighbors import nearest, spacing
+from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
-from urrt_jax.model.network import Model, estimate_subsampled, point_regions
-from urrt_jax.refine.icp import ICP, icp
+from urrt_jax.model.network import Model, estimate, point_regions
+from urrt_jax.refine import ICP, icp
 from urrt_jax.search import Search
 from urrt_jax.search import search as find_pose
 from urrt_jax.weights import load_model
 
-# Chosen on held-out training shapes, clean and corrupted, for telling right poses from wrong ones.
-_REACH_SPACINGS = 1.5
-_LEAST_CONTACT = 0.6
-# A searched pose may overlap by less, where points that come near mostly touch: surfaces that cross don't.
-_LEAST_SEARCHED_CONTACT = 0.3
-_LEAST_TIGHTNESS, _NEAR = 0.6, 4.0
-_CONTACT_POINTS = 4096
 _LARGEST = 1e15
 
 
@@ -53,10 +47,17 @@ class Registration:
         transform (Open3D's definition); over all points, not the subsample.
       rmse: (), the root mean square distance of those inliers, in the input's units; 0 when there are none.
       inlier_distance: (), the distance that was used, in the input's units.
+      overlap: (2,), the share of the source's points that lie within 1.5 spacings (the coarser cloud's) of the target,
+        and of the target's (up to 4096 of them) that lie as near the source.
+      confidence: (), from 0 to 1: how sure it is that the surfaces lie on each other rather than cross, by their
+        overlap and by how many of the points that come near touch; learned on training shapes. It cannot exclude a
+        wrong pose of a shape that is nearly symmetric.
       converged: (), bool: the input was finite and not collinear, refinement settled within its iterations (where
-        there was refinement), and at least 0.6 of the points of one of the clouds lie within 1.5 spacings of the
-        other; after a search, 0.3 of them, if 0.6 of those within 6 spacings do. It cannot exclude a wrong pose of a
-        shape that is nearly symmetric.
+        there was refinement), and the confidence is at least 0.5.
+      correspondences: (N,) int32, the row of the target's point nearest to every source point, -1 where none lies
+        within ``inlier_distance``.
+      information: (6, 6), of the pose, from these correspondences: Σ GᵀG, G = [I, −[q]×] at target points q, for small
+        motions (translation, rotation vector) about the target's origin; what pose graphs take (Choi et al. 2015).
       source_regions: (N,) int32, the region of every source point (as aligned); 0 for padding and for model A.
       target_regions: (M,) int32, the same for the target.
       coarse: the network's own estimate, before refinement.
@@ -68,7 +69,11 @@ class Registration:
     fitness: Array
     rmse: Array
     inlier_distance: Array
+    overlap: Array
+    confidence: Array
     converged: Array
+    correspondences: Array
+    information: Array
     source_regions: Array
     target_regions: Array
     coarse: Rigid
@@ -193,6 +198,7 @@ def _restore_origins(result: Registration, source: np.ndarray | None, target: np
         result,
         translation=shifted(result.rotation, result.translation),
         coarse=result.coarse._replace(translation=shifted(*result.coarse)),
+        information=moved_information(result.information, origin_out),
     )
 
 
@@ -209,31 +215,21 @@ def _register(
 ) -> Registration:
     raw_source, raw_target = make_cloud(source_points, source_mask), make_cloud(target_points, target_mask)
     source, target, frame = normalize_pair(raw_source, raw_target)
-    answer = estimate_subsampled(model, source, target)
+    prepared = prepare(source), prepare(target)
+    small = _even_samples(*prepared, model, refine)
+    answer = estimate(model, *(jax.tree.map(lambda leaf: leaf[: model.config.points], cloud) for cloud in small))
     start, trusted = answer.transform, None
     if search is not None:
-        start, _, trusted = find_pose(model, source, target, search, start)
+        start, _, trusted = find_pose(model, *prepared, search, start)
     if refine is None:
         transform, settled, steps = start, jnp.array(True), jnp.array(0)
     else:
-        transform, settled, steps = icp(source, target, start, refine, reach=trusted)
+        transform, settled, steps = icp(*prepared, start, refine, reach=trusted, small=small)
 
-    touching = _REACH_SPACINGS * jnp.maximum(_coarser_spacing(source, target), 1e-6)
-    reach = touching if inlier_distance is None else jnp.asarray(inlier_distance) / frame.scale
-    distances = nearest(rigid.apply(transform, source.points), target).squared
-    fitness, rmse = inlier_share(source.mask, distances, reach)
-    some = thin(target, _CONTACT_POINTS)
-    back = nearest(rigid.apply(rigid.inverse(transform), some.points), source).squared
-
-    def shares(within: Array) -> Array:
-        sides = (source.mask, distances), (some.mask, back)
-        return jnp.stack([inlier_share(mask, squared, within)[0] for mask, squared in sides])
-
-    contact = shares(touching)
-    fits = jnp.max(contact) >= _LEAST_CONTACT
-    if search is not None:
-        tight = jnp.sum(contact) >= _LEAST_TIGHTNESS * jnp.sum(shares(_NEAR * touching))
-        fits |= (jnp.max(contact) >= _LEAST_SEARCHED_CONTACT) & tight
+    found = fit(*prepared, transform)
+    reach = found.touching if inlier_distance is None else jnp.asarray(inlier_distance) / frame.scale
+    fitness, rmse = inlier_share(source.mask, found.squared, reach)
+    inlier = source.mask & (found.squared <= reach**2)
     usable = well_posed(source) & well_posed(target) & jnp.all(jnp.isfinite(transform.translation))
     seen = rigid.apply(answer.seen, source.points)
     return Registration(
@@ -242,7 +238,11 @@ def _register(
         fitness=fitness,
         rmse=rmse * frame.scale,
         inlier_distance=reach * frame.scale,
-        converged=usable & settled & fits,
+        overlap=found.overlap,
+        confidence=jnp.where(usable, found.confidence, 0.0),
+        converged=usable & settled & (found.confidence >= 0.5),
+        correspondences=jnp.where(inlier, found.nearest, -1),
+        information=information(raw_target.points[found.nearest], inlier),
         source_regions=jnp.where(source.mask, point_regions(model, seen, answer.source), 0),
         target_regions=jnp.where(target.mask, point_regions(model, target.points, answer.target), 0),
         coarse=Rigid(
@@ -253,24 +253,7 @@ def _register(
     )
 
 
-def inlier_share(mask: Array, squared: Array, reach: Array) -> tuple[Array, Array]:
-    """The share of real points whose squared distance (N,) is within ``reach``, and the rmse of those, in its unit."""
-    inlier = mask & (squared <= reach**2)
-    count = jnp.sum(inlier)
-    mean = jnp.sum(jnp.where(inlier, squared, 0.0)) / jnp.maximum(count, 1)
-    rmse = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1.0)), 0.0)
-    return count / jnp.maximum(jnp.sum(mask), 1), rmse
-
-
-def _coarser_spacing(source: Cloud, target: Cloud) -> Array:
-    """The larger of both clouds' spacings, each asked at up to 1024 points."""
-    return jnp.maximum(*(spacing(jax.lax.stop_gradient(cloud), sample=thin(cloud, 1024)) for cloud in (source, target)))
-
-
-def well_posed(cloud: Cloud) -> Array:
-    """Whether a centred cloud determines a rotation, (): at least three points, not all on one line."""
-    points = jax.lax.stop_gradient(cloud.points)
-    # Rounding alone gives points on a line a second moment of about 1e-7 of the first.
-    moments = jnp.matmul(points.T, points, precision=jax.lax.Precision.HIGHEST)
-    widths = jnp.linalg.eigvalsh(moments)
-    return (jnp.sum(cloud.mask) >= 3) & (widths[1] > 1e-6 * widths[2])
+def _even_samples(source: Prepared, target: Prepared, model: Model, refine: ICP | None) -> tuple[Cloud, Cloud]:
+    """Both clouds' farthest-point samples, large enough for the network and for refinement's first stage."""
+    count = max(model.config.points, 0 if refine is None else 2 * refine.coarse_points)
+    return subsample(source.cloud, count, order=source.order), subsample(target.cloud, count, order=target.order)

@@ -4,8 +4,10 @@
 
 Pairs follow the clean DCP protocol, 1,024 points, on the test split of PATH (procedural shapes by default). Each figure
 is taken after a warm-up that compiles: the median of the repeats, for peers the mean over the pairs, for the large
-pairs one run. The command line is timed as whole processes on two files of 40,000 points: the first run compiles. Peers
-are optional: `pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
+pairs one run in a process of its own, with its peak of memory. Where PATH holds the scans, register with search and the
+peers for scans are timed on the same 12 pairs (the last column is their share within 1°). The command line is timed as
+whole processes on two files of 40,000 points: the first run compiles. Peers are optional:
+`pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
 """
 
 import argparse
@@ -26,9 +28,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from urrt_jax import load_model, model_card, register
+from urrt_jax import Search, load_model, model_card, pad_clouds, register
 from urrt_jax.data import demo_shape, find_data, load_shapes
-from urrt_jax.evaluation import PROTOCOLS, pose_errors, summarize
+from urrt_jax.evaluation import PROTOCOLS, load_scan_pairs, pose_errors, rotation_degrees, summarize
 from urrt_jax.geometry.clouds import make_cloud
 from urrt_jax.io import write_cloud
 from urrt_jax.model.network import predict
@@ -36,8 +38,11 @@ from urrt_jax.peers import PEERS
 
 HERE = Path(__file__).parent
 BATCH = 64
-LARGE = (80_000, 400_000)
-PEERS_TIMED = ("icp", "gicp", "fgr", "fgr_icp")
+LARGE = (40_000, 200_000, 1_000_000)
+PEERS_TIMED = ("icp", "gicp", "fgr", "fgr_icp", "icp_starts")
+SCANS = "bunny_scans.npz"
+SCAN_PEERS_TIMED = ("scan_ransac", "scan_kiss")
+SCAN_PAIRS = 12
 
 
 def seconds(function: Callable[[], object], repeats: int) -> float:
@@ -71,6 +76,52 @@ def command_line_seconds() -> dict[str, float]:
             "second": whole_process(*pair),
             "help": whole_process("register", "--help"),
         }
+
+
+def measure_large(size: int) -> dict:
+    """The time of one large pair, and the process's peak of memory, compilation included."""
+    cloud = demo_shape(2 * size)
+    turn = Rotation.from_euler("zyx", [10, 20, 30], degrees=True).as_matrix()
+    pair = jnp.asarray(cloud[::2]), jnp.asarray((cloud[1::2] @ turn.T + 0.1).astype(np.float32))
+    took = seconds(lambda: jax.block_until_ready(register(pair[0], pair[1])), 1)
+    # Not ru_maxrss: a child inherits that from the process that started it.
+    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return {"seconds": took, "peak_gib": int(peak.split()[1]) / 2**20}
+
+
+def measure_scans(path: Path) -> list[dict]:
+    """`register` with search, and peers, on the same pairs of scans of some 40,000 points, one pair a call."""
+    data, _ = load_scan_pairs(path)
+    # One padded size: the program is compiled once, as for any stream of scans.
+    trials = [trial for trial in data if max(len(trial.source), len(trial.target)) <= 49_152][:SCAN_PAIRS]
+    single, errors = [], []
+    for trial in tqdm([trials[0], *trials], desc="scans"):
+        (source, target), (source_mask, target_mask) = pad_clouds([trial.source, trial.target], size=49_152)
+        start = time.perf_counter()
+        masks = {"source_mask": source_mask, "target_mask": target_mask}
+        found = jax.block_until_ready(register(source, target, **masks, search=Search()))
+        single.append(time.perf_counter() - start)
+        errors.append(float(rotation_degrees(found.rotation, trial.rotation)))
+    share = float(np.mean(np.array(errors[1:]) < 1))
+    rows = [row("scans of 40,000 points: register with search", statistics.median(single[1:]), share)]
+    for name in SCAN_PEERS_TIMED:
+        peer = PEERS[name]
+        try:
+            peer.versions()
+        except ImportError as error:
+            rows.append({"method": f"{peer.title}: not measured, {error}"})
+            continue
+        single, errors = [], []
+        for trial in tqdm(trials, desc=peer.title):
+            start = time.perf_counter()
+            try:
+                matrix = peer.align_pair(trial.source.astype(np.float64), trial.target.astype(np.float64))
+            except RuntimeError:  # too few matches: a pair that is not found
+                matrix = np.eye(4)
+            single.append(time.perf_counter() - start)
+            errors.append(float(rotation_degrees(matrix[:3, :3], trial.rotation)))
+        rows.append(row(f"scans: {peer.title}", statistics.median(single), float(np.mean(np.array(errors) < 1))))
+    return rows
 
 
 def measure(data: str, pairs: int, repeats: int) -> dict:
@@ -110,11 +161,10 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
     rows.append(row("register, one pair a call", statistics.median(single), None))
 
     for size in LARGE:
-        cloud = demo_shape(size)
-        turn = Rotation.from_euler("zyx", [10, 20, 30], degrees=True).as_matrix()
-        pair = jnp.asarray(cloud[::2]), jnp.asarray((cloud[1::2] @ turn.T + 0.1).astype(np.float32))
-        took = seconds(lambda pair=pair: jax.block_until_ready(register(pair[0], pair[1])), 1)
-        rows.append(row(f"register, one pair of {size // 2:,} points", took, None))
+        # A process of its own, so that its peak of memory is this pair's.
+        done = subprocess.run([sys.executable, __file__, "--large", str(size)], check=True, capture_output=True)
+        large = json.loads(done.stdout)
+        rows.append(row(f"register, one pair of {size:,} points: {large['peak_gib']:.2f} GiB", large["seconds"], None))
 
     for name in PEERS_TIMED:
         peer = PEERS[name]
@@ -132,6 +182,8 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
         errors = pose_errors(stacked[:, :3, :3], stacked[:, :3, 3], rotations[:count], translations[:count])
         title = f"{peer.title} {' '.join(versions.values())}, one pair a call"
         rows.append(row(title, statistics.mean(single), summarize(errors)["recall_1deg"]))
+    if (Path(data) / SCANS).is_file():
+        rows += measure_scans(Path(data) / SCANS)
     return {
         "command": "python experiments/benchmarks/speed.py "
         f"--data {Path(data).name} --pairs {pairs} --repeats {repeats}",
@@ -173,7 +225,11 @@ if __name__ == "__main__":
     parser.add_argument("--data", help="ModelNet40 as 'urrt evaluate' takes it; by default $URRT_DATA, else procedural")
     parser.add_argument("--pairs", type=int, default=256, help="how many pairs, a multiple of 64")
     parser.add_argument("--repeats", type=int, default=5, help="timed repeats of the batched rows")
+    parser.add_argument("--large", type=int, help="measure only one pair of so many points and print it as JSON")
     given = parser.parse_args()
+    if given.large:
+        print(json.dumps(measure_large(given.large)))
+        sys.exit()
     if given.pairs < BATCH:
         parser.error(f"--pairs: expected at least {BATCH}, got {given.pairs}")
     result = measure(find_data(given.data), given.pairs, given.repeats)

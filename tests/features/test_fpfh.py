@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from urrt_jax.features import fpfh
-from urrt_jax.features.fpfh import BINS, _shares
+from urrt_jax.features.fpfh import BINS, _shares, _turn
 from urrt_jax.geometry.clouds import centroid, make_cloud
 from urrt_jax.geometry.normals import normals
 
@@ -163,7 +163,7 @@ def test_a_plane_s_features_have_one_bin_each():
 
 
 def _sums_to_one(values) -> None:
-    np.testing.assert_allclose(_shares(jnp.asarray(values, jnp.float32)).sum(axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(_shares(jnp.asarray(values, jnp.float32)).sum(axis=0), 1, atol=1e-5)
 
 
 @given(st.lists(st.floats(-1, 1, width=32), min_size=8, max_size=8))
@@ -183,7 +183,14 @@ def test_shares_of_values_beyond_the_ends_sum_to_one(value):
 
 @pytest.mark.parametrize(("value", "full"), [(-1.0, 0), (0.0, BINS // 2), (1.0, BINS - 1)])
 def test_shares_at_the_ends_and_the_middle_go_to_one_bin(value, full):
-    np.testing.assert_allclose(_shares(jnp.array([value]))[0], np.eye(BINS)[full], atol=1e-5)
+    np.testing.assert_allclose(_shares(jnp.array([value]))[:, 0], np.eye(BINS)[full], atol=1e-5)
+
+
+def test_turn_rises_with_the_angle_and_meets_itself_at_half_a_turn():
+    angles = np.linspace(-np.pi, np.pi, 721)[1:-1]
+    places = np.asarray(_turn(jnp.sin(angles), jnp.cos(angles)))
+    assert np.all(np.diff(places) > 0)
+    np.testing.assert_allclose(places[[0, 180, 360, 540, -1]], [-1, -0.5, 0, 0.5, 1], atol=0.01)
 
 
 def test_shares_are_not_negative():

@@ -10,7 +10,7 @@ from urrt_jax.geometry.clouds import centroid, make_cloud
 from urrt_jax.geometry.normals import least_axis, normals
 
 _RADIUS = 0.3
-_normals = jax.jit(normals, static_argnames="batch_size")
+_normals = jax.jit(normals, static_argnames=())
 _least_axes = jax.jit(jax.vmap(least_axis))
 
 
@@ -131,14 +131,6 @@ def test_padding_does_not_change_normals(points):
     np.testing.assert_allclose(found[clear], expected[clear], atol=1e-4)
 
 
-@pytest.mark.parametrize("batch_size", [1, 7])
-def test_batch_size_does_not_change_normals(batch_size):
-    points = _sphere(60)
-    found = _normals(points, make_cloud(points), 0.6, jnp.zeros(3), batch_size=batch_size)
-    expected = _normals(points, make_cloud(points), 0.6, jnp.zeros(3))
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
 def test_vmap_agrees_with_a_loop():
     clouds = np.stack([_sphere(80) * scale for scale in (1.0, 0.9, 0.8)]).astype(np.float32)
     together = jax.vmap(lambda p: normals(p, make_cloud(p), 0.6, jnp.zeros(3)))(clouds)
@@ -234,3 +226,36 @@ def test_least_axis_of_a_multiple_of_one_is_z(multiple):
 @pytest.mark.parametrize("widths", [(0, 0, 0), (0, 0, 1), (1, 1, 2), (0, 1, 1), (5, 5, 5)])
 def test_least_axis_is_a_unit_vector(widths):
     np.testing.assert_allclose(np.linalg.norm(_least_axes(_symmetric(widths)), axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("widths", [(1, 2, 3), (0, 1, 2), (0, 1, 1), (1e-6, 0.2, 0.25), (-3, -2, -1), (0, 0.01, 1)])
+def test_derivative_of_least_axis_agrees_with_finite_differences(widths, x64):
+    spread = jnp.asarray(_symmetric(widths, 20), x64)
+    spread = (spread + jnp.swapaxes(spread, 1, 2)) / 2
+    change = jnp.asarray(_symmetric((1, -0.5, 0.7), 40)[20:], x64)
+    change = (change + jnp.swapaxes(change, 1, 2)) / 2
+    _, slope = jax.jvp(_least_axes, (spread,), (change,))
+    expected = (_least_axes(spread + 1e-6 * change) - _least_axes(spread - 1e-6 * change)) / 2e-6
+    np.testing.assert_allclose(slope, expected, atol=1e-6 * float(jnp.max(jnp.abs(expected))))
+
+
+@pytest.mark.parametrize("widths", [(0, 0, 0), (0, 0, 1), (1, 1, 2), (0, 1, 1), (5, 5, 5), (0, 1e-8, 1)])
+def test_derivative_of_least_axis_is_finite(widths):
+    spread = jnp.asarray(_symmetric(widths, 20))
+    _, slope = jax.jvp(_least_axes, (spread,), (jnp.ones_like(spread),))
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_derivative_of_normals_agrees_with_finite_differences(points, both, x64):
+    """When the cloud moves, and when the places move too; while neighbourhoods hold, these alone change nothing."""
+    points = jnp.asarray(points[_well_determined(points)], x64)
+    direction = jnp.asarray(np.random.default_rng(1).normal(size=points.shape))
+
+    def at(step):
+        moved = points + step * direction
+        return _normals(moved if both else points, make_cloud(moved), _RADIUS, jnp.zeros(3))
+
+    _, slope = jax.jvp(at, (0.0,), (1.0,))
+    expected = (at(1e-7) - at(-1e-7)) / 2e-7
+    np.testing.assert_allclose(slope, expected, atol=1e-5 * float(jnp.max(jnp.abs(expected))))

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from urrt_jax.data import demo_shape
 from urrt_jax.evaluation import evaluate, find_method, rotation_degrees
-from urrt_jax.peers import FGR, PEERS, OnScans, PrincipalAxes
+from urrt_jax.peers import FGR, PEERS, MultiStartICP, OnScans, Open3DICP, PrincipalAxes
 
 LIBRARIES = {
     "icp": "open3d", "icp_identity": "open3d", "icp_plane": "open3d", "fgr": "open3d", "fgr_icp": "open3d",
     "ransac": "open3d", "ransac_icp": "open3d", "gicp": "small_gicp", "kiss": "kiss_matcher", "goicp": "py_goicp",
-    "scan_fgr": "open3d", "scan_icp": "open3d", "scan_ransac": "open3d", "scan_kiss": "kiss_matcher",
+    "icp_starts": "open3d", "scan_fgr": "open3d", "scan_icp": "open3d", "scan_ransac": "open3d",
+    "scan_kiss": "kiss_matcher",
 }  # fmt: skip
 
 
@@ -55,6 +57,46 @@ def test_peers_align_an_easy_pair(pair, name):
     assert found.shape == (4, 4)
     if name != "identity":
         assert rotation_degrees(found[:3, :3], rotation) < 5.0
+
+
+@pytest.fixture(scope="module")
+def turned_pair():
+    """Two samples of one shape, 80° apart, and the rotation."""
+    shape = demo_shape(2000).astype(np.float64)
+    rotation = Rotation.from_rotvec(np.deg2rad(80) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    return shape[:1000], shape[1000:] @ rotation.T + 0.1, rotation
+
+
+def test_icp_from_many_rotations_finds_a_pose_that_one_start_misses(turned_pair):
+    pytest.importorskip("open3d", exc_type=ImportError)
+    source, target, rotation = turned_pair
+    assert rotation_degrees(Open3DICP().align_pair(source, target)[:3, :3], rotation) > 30.0
+    assert rotation_degrees(MultiStartICP().align_pair(source, target)[:3, :3], rotation) < 2.0
+
+
+def test_icp_from_many_rotations_gives_the_same_answer_again(turned_pair):
+    pytest.importorskip("open3d", exc_type=ImportError)
+    # After one iteration the answer still shows which rotations were drawn.
+    peer = MultiStartICP(starts=4, iterations=1, polish_iterations=1)
+    first = peer.align_pair(*turned_pair[:2])
+    np.testing.assert_allclose(peer.align_pair(*turned_pair[:2]), first, rtol=0, atol=1e-9)
+
+
+def test_starting_rotations_are_the_identity_and_others_within_the_angle():
+    rotations = MultiStartICP(starts=500, max_angle=60.0).rotations()
+    np.testing.assert_array_equal(rotations[0], np.eye(3))
+    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2) - np.eye(3), 0.0, atol=1e-12)
+    angles = rotation_degrees(rotations[1:], np.eye(3))
+    assert angles.min() > 0
+    assert angles.max() <= 60.0 + 1e-9
+
+
+def test_starting_rotations_are_uniform():
+    """The share of all rotations that turn by at most a is (a - sin a) / π."""
+    rotations = MultiStartICP(starts=2000, max_angle=180.0).rotations()
+    within = np.mean(rotation_degrees(rotations[1:], np.eye(3)) <= 90.0)
+    assert within == pytest.approx((np.pi / 2 - 1) / np.pi, abs=0.03)
+    np.testing.assert_allclose(rotations[1:].mean(axis=0), 0.0, atol=0.06)
 
 
 @pytest.mark.parametrize("unit", [0.01, 1000.0])

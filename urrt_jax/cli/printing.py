@@ -21,7 +21,10 @@ def as_dict(result: Registration) -> dict[str, Any]:
         "translation": matrix[:3, 3].tolist(),
         "fitness": float(result.fitness),
         "rmse": float(result.rmse),
+        "overlap": np.asarray(result.overlap, np.float64).tolist(),
+        "confidence": float(result.confidence),
         "converged": bool(result.converged),
+        "information": np.asarray(result.information, np.float64).tolist(),
     }
 
 
@@ -37,6 +40,8 @@ def as_table(result: Registration) -> str:
         "",
         f"fitness      {float(result.fitness):<8.4f} share of the source within {reach} of the target",
         f"rmse         {float(result.rmse):<8.4g} of those points",
+        "overlap      {:.0%} of the source, {:.0%} of the target".format(*np.asarray(result.overlap).tolist()),
+        f"confidence   {float(result.confidence):.3f}",
         "converged    yes" if result.converged else "converged    NO       do not rely on this transform",
     ]
     return "\n".join(lines)

@@ -19,7 +19,8 @@ class Register:
     Attributes:
         source: File of the cloud that moves.
         target: File of the cloud that stays.
-        json: Print one JSON object: matrix, rotation, translation, fitness, rmse, converged.
+        json: Print one JSON object: matrix, rotation, translation, fitness, rmse, overlap, confidence, converged,
+            information.
         out: Write the moved source here, as .ply (coloured by region), .xyz or .npy.
         picture: Write a picture of before and after here (.png, .pdf or .svg).
         search: Look among all poses, whatever the rotation and with partial overlap: 'auto' where the plain result has

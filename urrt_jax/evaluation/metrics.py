@@ -111,3 +111,16 @@ def summarize(errors: dict[str, np.ndarray], scales: ArrayLike = 1.0) -> dict[st
 def recall_curve(angles: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
     """The share of angles (B,) below each threshold (T,), in degrees; (T,)."""
     return np.searchsorted(np.sort(angles), thresholds, side="left") / len(angles)
+
+
+def roc_curve(right: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """How well a confidence (B,) tells right poses from wrong ones, ``right`` (B,) bool: the curve and its area.
+
+    The shares (K,) of wrong and of right poses at or above each confidence, from none to all, and the area under the
+    curve: the chance that a right pose is surer than a wrong one (ties count half). NaN where all are right, or none.
+    """
+    order = np.argsort(-confidence, kind="stable")
+    last = np.append(np.diff(confidence[order]) != 0, True)
+    shares = [np.append(0.0, np.cumsum(kind[order])[last] / max(np.sum(kind), 1)) for kind in (~right, right)]
+    area = float(np.trapezoid(shares[1], shares[0])) if right.any() and not right.all() else float("nan")
+    return shares[0], shares[1], area

@@ -14,6 +14,8 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from urrt_jax.geometry.curve import curve_order
+
 
 class Cloud(NamedTuple):
     """Points of one cloud and which of them are real.
@@ -221,38 +223,30 @@ def farthest_points(cloud: Cloud, count: int) -> tuple[Array, Array]:
     return jnp.concatenate([first[None], index]), jnp.concatenate([cloud.mask[first][None], new])
 
 
-def subsample(cloud: Cloud, count: int) -> Cloud:
-    """At most ``count`` points that cover the cloud evenly (``farthest_points``); the cloud itself when it is smaller.
+def subsample(cloud: Cloud, count: int, *, order: Array | None = None) -> Cloud:
+    """At most ``count`` points that cover the cloud evenly, farthest first (``farthest_points``).
 
-    A cloud far larger than ``count`` is first thinned to 8·count points along a space-filling curve.
+    Any first part of them covers the cloud evenly too. A cloud far larger than ``count`` is first thinned to 8·count
+    points along a space-filling curve, whose ``order`` may be at hand.
     """
     size = cloud.points.shape[0]
-    if size <= count:
-        return cloud
     if size > 16 * count:
-        cloud = thin(cloud, 8 * count)
-    index, new = farthest_points(cloud, count)
+        cloud = thin(cloud, 8 * count, order=order)
+    index, new = farthest_points(cloud, min(size, count))
     chosen = take(cloud, index)
     return Cloud(jnp.where(new[:, None], chosen.points, 0.0), new)
 
 
-def thin(cloud: Cloud, count: int) -> Cloud:
-    """Every k-th real point along a Morton curve: ``count`` points whose density follows the cloud's own.
+def thin(cloud: Cloud, count: int, *, order: Array | None = None) -> Cloud:
+    """Every k-th real point along a space-filling curve: ``count`` points whose density follows the cloud's own.
 
-    The curve is laid over the cloud's bounding box with 2^10 cells a side (Morton 1966), so the choice does not depend
-    on the order of the points beyond those that share a cell. Costs one sort; a cloud of ``count`` points or fewer
-    is returned as it is.
+    The choice does not depend on the order of the points (``curve_order``). Costs one sort, unless ``order`` is that
+    curve's; a cloud of ``count`` points or fewer is returned as it is.
     """
     size = cloud.points.shape[0]
     if size <= count:
         return cloud
-    points = jax.lax.stop_gradient(cloud.points)
-    low = jnp.min(jnp.where(cloud.mask[:, None], points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(cloud.mask[:, None], points, -jnp.inf), axis=0)
-    extent = jnp.maximum(jnp.max(high - low), jnp.finfo(points.dtype).tiny)
-    cell = jnp.clip((points - low) / extent * 1023.0, 0, 1023).astype(jnp.uint32)
-    code = sum(_spread_bits(cell[:, k]) << k for k in range(3))
-    order = jnp.argsort(jnp.where(cloud.mask, code, jnp.uint32(2**31)))
+    order = curve_order(cloud.points, cloud.mask) if order is None else order
     real = jnp.sum(cloud.mask)
     # Integer strides while there are more real points than places; otherwise all of them, then padding. The remainder's
     # share is a quotient of floats, because slots · rest overflows; whole strides keep the places distinct.
@@ -260,10 +254,3 @@ def thin(cloud: Cloud, count: int) -> Cloud:
     whole, rest = real // count, real % count
     strided = slots * whole + jnp.minimum(jnp.floor(slots * (rest / count)).astype(slots.dtype), rest)
     return take(cloud, order[jnp.where(real > count, strided, slots)])
-
-
-def _spread_bits(value: Array) -> Array:
-    """The ten low bits of ``value`` with two zeros between neighbours."""
-    for shift_by, keep in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        value = (value | (value << shift_by)) & jnp.uint32(keep)
-    return value

@@ -6,36 +6,56 @@ from jax import Array
 
 from urrt_jax.geometry.clouds import Cloud
 
+_BLOCK = 16
+_HIGHEST = jax.lax.Precision.HIGHEST
 _SINGULAR = 1e-4  # what rounding leaves of a cross product of rows of size 1 that should vanish
 
 
-def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array, *, batch_size: int = 256) -> Array:
+def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array) -> Array:
     """Unit normals (N, 3) of the surface that ``cloud`` samples, at ``points`` (N, 3).
 
     The direction in which the cloud's points within ``radius`` vary least (Hoppe et al. 1992). Its sign is the one that
     points away from ``centre`` (3,), the cloud's centroid, say: scans and solids are oriented alike then, wherever they
-    are not seen edge-on. Where fewer than three points are near, it is still a unit vector, of no meaning.
+    are not seen edge-on. Where fewer than three points are near, it is still a unit vector, of no meaning. Derivatives
+    are those of the neighbourhoods at hand.
 
     Args:
       points: where.
-      cloud: M points.
+      cloud: M points; the loop goes over them once, for all N at a time, so memory is O(N + M).
       radius: of the neighbourhood.
       centre: what normals point away from.
-      batch_size: points handled at once, which bounds memory by batch_size · M.
     """
-
-    def one(point: Array) -> Array:
-        offset = cloud.points - point
-        near = cloud.mask & (jnp.sum(offset**2, axis=-1) < radius**2)
-        weight = near / jnp.maximum(jnp.sum(near), 1)
-        centred = (offset - weight @ offset) / radius
-        spread = jnp.matmul(centred.T * weight, centred, precision=jax.lax.Precision.HIGHEST)
-        normal = least_axis(spread)
-        return jnp.where(jnp.dot(normal, point - centre) < 0, -normal, normal)
-
-    return jax.lax.map(one, points, batch_size=min(batch_size, points.shape[0]))
+    spread = jnp.moveaxis(_spreads(points, cloud, jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))), -1, 0)
+    normal = jax.vmap(least_axis)(spread)
+    inward = jnp.sum(normal * (points - centre), axis=-1, keepdims=True) < 0
+    return jnp.where(inward, -normal, normal)
 
 
+def _spreads(points: Array, cloud: Cloud, radius: Array) -> Array:
+    """The covariances (3, 3, N) of the offsets, in radii, from each point to the cloud's points within the radius."""
+    count = cloud.points.shape[0]
+    block = min(_BLOCK, count)
+    far = ~cloud.mask[:, None] * jnp.finfo(points.dtype).max ** 0.25
+    others = jnp.pad((cloud.points + far) / radius, ((0, -count % block), (0, 0)), constant_values=1e9)
+    at = points.T / radius
+
+    def visit(sums: tuple[Array, ...], some: Array) -> tuple[tuple[Array, ...], None]:
+        for j in range(block):
+            x, y, z = (some[j, k] - at[k] for k in range(3))
+            near = (x**2 + y**2 + z**2 < 1).astype(points.dtype)
+            x, y, z = near * x, near * y, near * z
+            terms = near, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z
+            sums = tuple(old + term for old, term in zip(sums, terms, strict=True))
+        return sums, None
+
+    nothing = (jnp.zeros_like(at[0]),) * 10
+    (number, *rest), _ = jax.lax.scan(visit, nothing, others.reshape(-1, block, 3))
+    x, y, z, xx, xy, xz, yy, yz, zz = (each / jnp.maximum(number, 1) for each in rest)
+    xx, xy, xz, yy, yz, zz = xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z
+    return jnp.stack([jnp.stack(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
+
+
+@jax.custom_jvp
 def least_axis(spread: Array) -> Array:
     """A unit eigenvector (3,) of the smallest eigenvalue of a symmetric matrix (3, 3) of any scale, in closed form.
 
@@ -58,3 +78,22 @@ def least_axis(spread: Array) -> Array:
     vector = jnp.where(jnp.linalg.norm(longest) > _SINGULAR, longest, across)
     length = jnp.linalg.norm(vector)
     return jnp.where(length > _SINGULAR, vector / jnp.maximum(length, _SINGULAR), jnp.array([0.0, 0.0, 1.0]))
+
+
+@least_axis.defjvp
+def _least_axis_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """First-order perturbation of an eigenvector; nothing where another eigenvalue is nearly the same."""
+    (spread,), (change,) = primals, tangents
+    vector = least_axis(spread)
+    least = vector @ jnp.matmul(spread, vector, precision=_HIGHEST)
+    # In closed form in the plane across the vector: batches of LAPACK's eigh may wait for each other for ever on a CPU.
+    first = jnp.cross(vector, jnp.eye(3)[jnp.argmin(jnp.abs(vector))])
+    first /= jnp.linalg.norm(first)
+    plane = jnp.stack([first, jnp.cross(vector, first)])
+    above = jnp.matmul(plane, jnp.matmul(spread, plane.T, precision=_HIGHEST), precision=_HIGHEST) - least * jnp.eye(2)
+    along = jnp.matmul(plane, jnp.matmul(change, vector, precision=_HIGHEST), precision=_HIGHEST)
+    determinant = above[0, 0] * above[1, 1] - above[0, 1] * above[1, 0]
+    usable = determinant > 1e-3 * jnp.maximum(jnp.trace(above) ** 2, jnp.finfo(spread.dtype).tiny)
+    adjugate = jnp.array([[above[1, 1], -above[0, 1]], [-above[1, 0], above[0, 0]]])
+    turn = jnp.matmul(adjugate, along, precision=_HIGHEST) / jnp.where(usable, determinant, 1.0)
+    return vector, -jnp.matmul(jnp.where(usable, turn, 0.0), plane, precision=_HIGHEST)

@@ -8,7 +8,7 @@ shapes: clean, independently sampled with noise, cropped and with outliers (``ex
 
 from urrt_jax.peers.correspondences import FGR, RANSAC, KISSMatcher
 from urrt_jax.peers.goicp import GoICP
-from urrt_jax.peers.iterative import GICP, Open3DICP, PointToPlaneICP
+from urrt_jax.peers.iterative import GICP, MultiStartICP, Open3DICP, PointToPlaneICP
 from urrt_jax.peers.peer import Peer
 from urrt_jax.peers.polished import OnScans, Polished
 from urrt_jax.peers.simple import Identity, PrincipalAxes
@@ -18,6 +18,7 @@ PEERS: dict[str, Peer] = {
     "principal_axes": PrincipalAxes(),
     "icp_identity": Open3DICP(start="identity", iterations=50),
     "icp": Open3DICP(),
+    "icp_starts": MultiStartICP(),
     "icp_plane": PointToPlaneICP(),
     "gicp": GICP(),
     "fgr": FGR(),
@@ -34,6 +35,6 @@ PEERS: dict[str, Peer] = {
 """Every peer by its name, with the settings that our tables state."""
 
 __all__ = [
-    "FGR", "GICP", "PEERS", "RANSAC", "GoICP", "Identity", "KISSMatcher", "OnScans", "Open3DICP", "Peer",
-    "PointToPlaneICP", "Polished", "PrincipalAxes",
+    "FGR", "GICP", "PEERS", "RANSAC", "GoICP", "Identity", "KISSMatcher", "MultiStartICP", "OnScans", "Open3DICP",
+    "Peer", "PointToPlaneICP", "Polished", "PrincipalAxes",
 ]  # fmt: skip

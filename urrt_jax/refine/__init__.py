@@ -1,5 +1,6 @@
 """Refinement: from a rough transform to an exact one."""
 
-from urrt_jax.refine.icp import ICP, Refinement, icp
+from urrt_jax.refine.config import ICP
+from urrt_jax.refine.icp import Refinement, icp
 
 __all__ = ["ICP", "Refinement", "icp"]

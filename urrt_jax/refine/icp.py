@@ -1,56 +1,38 @@
-"""Iterative closest points, robust and coarse to fine, with a last step that differentiates.
+"""Iterative closest points, robust and coarse to fine, whose end differentiates.
 
-Besl and McKay 1992, with Geman-McClure weights that tighten step by step while it looks for the basin (as in Zhou et
-al. 2016) and a hard inlier distance once it is there.
+Stage one looks for the basin on small even subsamples, point to point (Besl and McKay 1992). Stage two makes it exact:
+pairs from both directions, distances along normals as well as between points. Both weigh pairs by Geman and McClure's
+function, whose width shrinks step by step (as in Zhou et al. 2016).
 """
 
-import dataclasses
-from collections.abc import Callable
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jax import Array
 
 from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud, subsample, thin
+from urrt_jax.geometry.clouds import Cloud, centroid, subsample
 from urrt_jax.geometry.neighbors import nearest, spacing
+from urrt_jax.geometry.normals import normals
+from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid, procrustes
+from urrt_jax.refine.config import ICP
+from urrt_jax.refine.lanes import while_each
+from urrt_jax.refine.pairs import Surface, find_pairs, pair_up, robust_weights, trimmed
+from urrt_jax.refine.step import bounded_step, damped_solve, move, normal_equations
+
+_SHRINK, _SHRINK_FINE = 0.8, 0.7
+_NORMAL_POINTS = 4096  # of a large cloud, that normals are made from
+_SEEN = 5.0  # pairs farther apart than this many reaches weigh less than 0.0015 and are not looked for
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ICP:
-    """How to refine. Lengths are relative to the clouds, so that units do not matter.
-
-    Attributes:
-      coarse_points: points of each cloud in the first stage, which looks for the basin; 0 skips that stage.
-      coarse_iterations: its iterations at most.
-      reach: the first stage's weights fall to a quarter at this distance, in units of the clouds' radius; it shrinks
-        from here to the spacing.
-      points: source points of the second stage; it compares them with every target point.
-      iterations: its iterations at most.
-      inlier_distance: second stage: pairs farther apart than this many of the target's spacings are left out; on its
-        way there the distance shrinks from the first stage's spacing.
-      tolerance: a stage has converged when a step turns by less than this (radians) and moves by less than this share
-        of the clouds' radius.
-    """
-
-    coarse_points: int = 256
-    coarse_iterations: int = 30
-    reach: float = 0.4
-    points: int = 2048
-    iterations: int = 60
-    inlier_distance: float = 2.0
-    tolerance: float = 2e-5
-
-    def __post_init__(self) -> None:
-        for name, least in (("coarse_points", 0), ("coarse_iterations", 1), ("points", 3), ("iterations", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
-        for name in ("reach", "inlier_distance", "tolerance"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+class _Progress(NamedTuple):
+    transform: Rigid
+    reach: Array
+    settled: Array
+    iteration: Array
 
 
 class Refinement(NamedTuple):
@@ -61,26 +43,20 @@ class Refinement(NamedTuple):
     iterations: Array
 
 
-Weigh = Callable[[Array, Array], Array]
-_LEAST_SPACING = 1e-6  # of clouds whose points all coincide
-
-
-class _Progress(NamedTuple):
-    transform: Rigid
-    reach: Array
-    motion: Array
-    settled: Array
-    iteration: Array
-
-
-def icp(source: Cloud, target: Cloud, initial: Rigid, config: ICP = ICP(), *, reach: Array | None = None) -> Refinement:
+def icp(
+    source: Cloud | Prepared,
+    target: Cloud | Prepared,
+    initial: Rigid,
+    config: ICP = ICP(),
+    *,
+    reach: Array | None = None,
+    small: tuple[Cloud, Cloud] | None = None,
+) -> Refinement:
     """The refined transform from source to target, starting at ``initial``, of clouds in units of their radius.
 
-    Point-to-point, from the source's points to their nearest target points. Stage one works on small even subsamples
-    with weights (1 + d²/r²)⁻² and lowers r step by step; stage two on up to ``config.points`` source points and the
-    whole target, with the pairs closer than a distance that falls to ``config.inlier_distance`` spacings. The transform
-    returned is one closed-form Procrustes step at the correspondences found: its derivatives with respect to both
-    clouds are exact while those correspondences hold, and none passes through the loop or to ``initial``.
+    No derivative passes through the iterations or to ``initial``; those of the transform with respect to both clouds
+    are exact while pairs and neighbourhoods hold, by the implicit function theorem at the end of stage two (a normal
+    from fewer than three neighbours has no meaning and counts as fixed).
 
     Args:
       source: N points.
@@ -88,116 +64,108 @@ def icp(source: Cloud, target: Cloud, initial: Rigid, config: ICP = ICP(), *, re
       initial: rough transform.
       config: how to refine.
       reach: the distance within which ``initial`` can be trusted, where it is known: the first stage is then left out.
+      small: even subsamples of both clouds (``subsample``), at least twice ``config.coarse_points``, if they are there.
     """
-    fixed: tuple[Cloud, Cloud, Rigid] = jax.tree.map(jax.lax.stop_gradient, (source, target, initial))
-    transform = fixed[2]
-    if reach is None:
-        transform, reach = _find_basin(*fixed, config) if config.coarse_points else (transform, jnp.array(config.reach))
-    return _settle(thin(source, config.points), target, transform, reach, config)
+    source, target, transform = prepare(source), prepare(target), jax.tree.map(jax.lax.stop_gradient, initial)
+    if reach is None and config.coarse_points:
+        if small is None:
+            size = 2 * config.coarse_points
+            small = subsample(source.cloud, size, order=source.order), subsample(target.cloud, size, order=target.order)
+        transform, reach = _find_basin(*small, transform, config)
+    elif reach is None:
+        reach = jnp.array(config.reach)
+    return _settle(source, target, transform, reach, config)
 
 
-def refine_from(
-    source: Cloud,
-    target: Cloud,
-    initial: Rigid,
-    reach: Array,
-    floor: Array,
-    *,
-    iterations: int,
-    tolerance: float = 1e-3,
+def anneal(
+    source: Cloud, target: Cloud, start: Rigid, reach: Array, floor: Array, *, iterations: int, tolerance: float = 1e-3
 ) -> Rigid:
-    """A few steps of robust ICP about ``initial``: weights (1 + d²/r²)⁻² with r falling from ``reach`` to ``floor``."""
-    return _iterate(source, target, initial, reach, floor, _geman_mcclure, iterations, tolerance).transform
-
-
-def _find_basin(source: Cloud, target: Cloud, initial: Rigid, config: ICP) -> tuple[Rigid, Array]:
-    """The first stage's transform, and the distance within which it can be trusted: the subsample's spacing."""
-    source, target = subsample(source, config.coarse_points), subsample(target, 2 * config.coarse_points)
-    floor = jnp.maximum(spacing(target), _LEAST_SPACING)
-
-    reach = jnp.maximum(config.reach, floor)
-    end = _iterate(source, target, initial, reach, floor, _geman_mcclure, config.coarse_iterations, config.tolerance)
-    return end.transform, end.reach
-
-
-def _settle(source: Cloud, target: Cloud, initial: Rigid, reach: Array, config: ICP) -> Refinement:
-    loose_source, loose_target = jax.tree.map(jax.lax.stop_gradient, (source, target))
-    fine = jnp.maximum(spacing(loose_target, sample=thin(loose_target, 1024)), _LEAST_SPACING)
-    floor = config.inlier_distance * fine
-
-    def weigh(squared: Array, reach: Array) -> Array:
-        return (squared < reach**2).astype(squared.dtype)
-
-    reach = jnp.maximum(reach, floor)
-    end = _iterate(loose_source, loose_target, initial, reach, floor, weigh, config.iterations, config.tolerance)
-    index, weights = _correspond(loose_source, loose_target, end.transform, end.reach, weigh)
-    last = procrustes(source.points, target.points[index], weights)
-    paired = jnp.sum(weights) >= 3
-    transform = jax.tree.map(lambda new, old: jnp.where(paired, new, old), last, end.transform)
-    return Refinement(transform, end.settled & paired, end.iteration)
-
-
-def _geman_mcclure(squared: Array, reach: Array) -> Array:
-    return (1 + squared / reach**2) ** -2
-
-
-def _correspond(source: Cloud, target: Cloud, transform: Rigid, reach: Array, weigh: Weigh) -> tuple[Array, Array]:
-    index, squared = nearest(rigid.apply(transform, source.points), target)
-    usable = source.mask & jnp.isfinite(squared)
-    return index, jnp.where(usable, weigh(jnp.where(usable, squared, 0.0), reach), 0.0)
-
-
-def _iterate(
-    source: Cloud,
-    target: Cloud,
-    start: Rigid,
-    reach: Array,
-    floor: Array,
-    weigh: Weigh,
-    iterations: int,
-    tolerance: float,
-) -> _Progress:
-    """Alternates correspondences and Procrustes until a step changes nothing, while ``reach`` falls to ``floor``."""
+    """Robust point-to-point ICP about ``start``, with weights whose width falls from ``reach`` to ``floor``."""
 
     def unfinished(now: _Progress) -> Array:
         return ~now.settled & (now.iteration < iterations)
 
-    def step(now: _Progress) -> _Progress:
-        index, weights = _correspond(source, target, now.transform, now.reach, weigh)
+    def step(fixed: tuple[Cloud, Cloud, Array], now: _Progress) -> _Progress:
+        source, target, floor = fixed
+        index, squared = nearest(rigid.apply(now.transform, source.points), target)
+        weights = robust_weights(jnp.where(source.mask, squared, jnp.inf), now.reach)
         new = procrustes(source.points, target.points[index], weights)
-        # Without three pairs there is nothing to solve; the transform stays and the stage ends unconverged.
+        # Without three pairs there is nothing to solve; the transform stays.
         paired = jnp.sum(weights > 0) >= 3
         new = jax.tree.map(lambda a, b: jnp.where(paired, a, b), new, now.transform)
-        motion = _logarithm(rigid.compose(new, rigid.inverse(now.transform)))
-        still = (jnp.linalg.norm(motion[:3]) < tolerance) & (jnp.linalg.norm(motion[3:]) < tolerance)
-        lowest = now.reach <= floor
-        ahead = jnp.where(lowest & ~still, _extrapolate(motion, now.motion), 0.0)
-        new = rigid.compose(_exponential(ahead * motion), new)
-        return _Progress(new, jnp.maximum(now.reach * 0.8, floor), motion, paired & still & lowest, now.iteration + 1)
+        shift = jnp.linalg.norm(new.translation - now.transform.translation)
+        still = (shift < tolerance) & (rigid.rotation_angle(new.rotation, now.transform.rotation) < tolerance)
+        return _Progress(new, jnp.maximum(now.reach * _SHRINK, floor), still & (now.reach <= floor), now.iteration + 1)
 
-    nothing = jnp.zeros(6, source.points.dtype)
-    return jax.lax.while_loop(unfinished, step, _Progress(start, reach, nothing, jnp.array(False), jnp.array(0)))
+    begin = _Progress(start, jnp.maximum(reach, floor), jnp.array(False), jnp.array(0))
+    return while_each(unfinished, step, begin, (source, target, floor)).transform
 
 
-def _extrapolate(motion: Array, before: Array) -> Array:
-    """How far to go on along this step, in steps: Aitken's limit of a geometric series, where two steps agree.
-
-    Near its end ICP creeps: each step is a fraction of the one before it, in the same direction (Besl and McKay 1992,
-    section IV.D). Steps that do not agree are left alone.
-    """
-    length = jnp.sum(before**2)
-    product = jnp.sum(motion * before)
-    ratio = product / jnp.maximum(length, 1e-30)
-    agree = product > 0.9 * jnp.sqrt(length * jnp.sum(motion**2))
-    return jnp.where(agree & (ratio < 1), jnp.minimum(ratio / jnp.maximum(1 - ratio, 1e-3), 8.0), 0.0)
+def _find_basin(source: Cloud, target: Cloud, initial: Rigid, config: ICP) -> tuple[Rigid, Array]:
+    """The first stage's transform, and the distance within which it can be trusted: the subsample's spacing."""
+    # Farthest-point samples: their first points are a coarser one.
+    source, target = _first(source, config.coarse_points), _first(target, 2 * config.coarse_points)
+    floor = jnp.maximum(spacing(target), 1e-6)  # points may all coincide
+    found = anneal(source, target, initial, jnp.array(config.reach), floor, iterations=config.coarse_iterations)
+    return found, floor
 
 
-def _logarithm(transform: Rigid) -> Array:
-    """The screw motion (6,) of a transform: translation, then rotation vector (jaxlie's order)."""
-    rotation = jaxlie.SO3.from_matrix(transform.rotation)
-    return jaxlie.SE3.from_rotation_and_translation(rotation, transform.translation).log()
+def _first(cloud: Cloud, count: int) -> Cloud:
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[:count]), cloud)
 
 
-def _exponential(motion: Array) -> Rigid:
-    moved = jaxlie.SE3.exp(motion)
-    return Rigid(moved.rotation().as_matrix(), moved.translation())
+def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, config: ICP) -> Refinement:
+    """The second stage, and the derivatives of its end."""
+    surfaces = _surface(source, config), _surface(target, config)
+    loose: tuple[Surface, Surface] = jax.tree.map(jax.lax.stop_gradient, surfaces)
+    floor = config.inlier_distance * jnp.maximum(source.spacing, target.spacing)
+
+    def weigh(squared: Array, reach: Array) -> Array:
+        return robust_weights(jnp.where(trimmed(squared), squared, jnp.inf) if config.trim else squared, reach)
+
+    def unfinished(now: _Progress) -> Array:
+        return ~now.settled & (now.iteration < config.iterations)
+
+    def step(fixed: tuple[Surface, Surface, Array], now: _Progress) -> _Progress:
+        source, target, floor = fixed
+        pairs = find_pairs(source, target, now.transform, _SEEN * now.reach, mutual=config.mutual)
+        weights = weigh(pairs.squared, now.reach)
+        # With fewer than three pairs the transform stays and never settles.
+        paired = jnp.sum(weights > 0) >= 3
+        motion = jnp.where(paired, bounded_step(*normal_equations(pairs, weights, config.plane)), 0.0)
+        still = (jnp.linalg.norm(motion[:3]) < config.tolerance) & (jnp.linalg.norm(motion[3:]) < config.tolerance)
+        settled = paired & still & (now.reach <= floor)
+        reach = jnp.maximum(now.reach * _SHRINK_FINE, floor)
+        return _Progress(move(motion, now.transform), reach, settled, now.iteration + 1)
+
+    start = _Progress(initial, jnp.maximum(reach, jax.lax.stop_gradient(floor)), jnp.array(False), jnp.array(0))
+    end = while_each(unfinished, step, start, (*loose, jax.lax.stop_gradient(floor)))
+
+    pairs = find_pairs(*loose, end.transform, _SEEN * end.reach, mutual=config.mutual)
+    counted = weigh(pairs.squared, end.reach) > 0
+    reach = end.reach * (floor / jax.lax.stop_gradient(floor))  # the spacing moves with the points
+
+    def gradient(motion: Array) -> Array:
+        here = pair_up(*surfaces, move(motion, end.transform), pairs.rows)
+        weights = robust_weights(jnp.where(counted, here.squared, jnp.inf), reach)
+        return normal_equations(here, weights, config.plane)[1]
+
+    # The end is where this gradient vanishes; how that place moves with the points is all that derivatives need.
+    rest = jax.lax.custom_root(
+        gradient,
+        jnp.where(end.settled, jnp.zeros(6), 0.0),  # depends on the pair: custom_root's guess must be batched with it
+        solve=lambda _, motion: motion,
+        tangent_solve=lambda linear, value: damped_solve(jax.jacobian(linear)(value), value),
+    )
+    return Refinement(move(rest, end.transform), end.settled, end.iteration)
+
+
+def _surface(cloud: Prepared, config: ICP) -> Surface:
+    """The points that ask, their normals, and the cloud prepared to answer."""
+    asking, dense = cloud.thin(config.points), cloud.thin(_NORMAL_POINTS)
+    if not config.plane:
+        return Surface(asking, jnp.zeros_like(asking.points), cloud.reference)
+    # Spacings grow as the square root of the points left out, on a surface.
+    thinner = math.sqrt(max(1.0, cloud.cloud.points.shape[0] / _NORMAL_POINTS))
+    radius = config.normal_radius * thinner * cloud.spacing
+    return Surface(asking, normals(asking.points, dense, radius, centroid(cloud.cloud)), cloud.reference)

@@ -8,12 +8,13 @@ from jax import Array
 
 from urrt_jax.features import fpfh
 from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud, centroid, subsample, thin
+from urrt_jax.geometry.clouds import Cloud, centroid, subsample
 from urrt_jax.geometry.neighbors import nearest, spacing
 from urrt_jax.geometry.normals import normals
+from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.network import Model, estimate
-from urrt_jax.refine.icp import refine_from
+from urrt_jax.refine.icp import anneal
 from urrt_jax.search.config import Search
 from urrt_jax.search.cover import rotation_cover
 from urrt_jax.search.matches import match_features, poses_from_matches
@@ -37,7 +38,7 @@ class Found(NamedTuple):
     reach: Array
 
 
-def search(model: Model, source: Cloud, target: Cloud, config: Search, plain: Rigid) -> Found:
+def search(model: Model, source: Cloud | Prepared, target: Cloud | Prepared, config: Search, plain: Rigid) -> Found:
     """The best pose among all hypotheses, of two clouds normalised together (``normalize_pair``).
 
     Hypotheses come from matched features (``poses_from_matches``), which partial overlap and any rotation leave alone,
@@ -47,12 +48,13 @@ def search(model: Model, source: Cloud, target: Cloud, config: Search, plain: Ri
     than the largest angle. A pure function: nothing is drawn.
     """
     # It is a choice: derivatives pass through what follows it.
-    model, source, target, plain = jax.tree.map(jax.lax.stop_gradient, (model, source, target, plain))
-    small = subsample(source, config.points), subsample(target, config.points)
+    model, plain = jax.tree.map(jax.lax.stop_gradient, (model, plain))
+    clouds: tuple[Prepared, Prepared] = jax.tree.map(jax.lax.stop_gradient, (prepare(source), prepare(target)))
+    small = _subsample(clouds[0], config.points), _subsample(clouds[1], config.points)
     width = jnp.maximum(jnp.maximum(*map(spacing, small)), 1e-6)
     guesses = [jax.tree.map(lambda leaf: leaf[None], plain)]
     if config.matches:
-        guesses.append(_from_features((source, target), small, width, config))
+        guesses.append(_from_features(clouds, small, width, config))
     if config.rotations:
         guesses.append(_from_network(model, *small, config.rotations))
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *guesses)
@@ -65,7 +67,7 @@ def search(model: Model, source: Cloud, target: Cloud, config: Search, plain: Ri
     _, best = jax.lax.top_k(first, min(config.kept, len(first)))
 
     def refined(pose: Rigid) -> tuple[Rigid, Array]:
-        better = refine_from(*small, pose, 3 * reach, reach, iterations=_STEPS)
+        better = anneal(*small, pose, 3 * reach, reach, iterations=_STEPS)
         return better, _score(better, small, small, reach)
 
     poses, scores = jax.vmap(refined)(jax.tree.map(lambda leaf: leaf[best], every))
@@ -75,17 +77,23 @@ def search(model: Model, source: Cloud, target: Cloud, config: Search, plain: Ri
     return Found(found, jnp.maximum(scores[winner], 0.0), width)
 
 
+def _subsample(cloud: Prepared, count: int) -> Cloud:
+    return subsample(cloud.cloud, count, order=cloud.order)
+
+
 def _allowed(poses: Rigid, config: Search) -> Array:
     """Which of H poses turn by no more than the largest angle, (H,)."""
     angles = rigid.rotation_angle(poses.rotation, jnp.eye(3))
     return angles <= jnp.deg2rad(config.max_angle) + 1e-4
 
 
-def _from_features(clouds: tuple[Cloud, Cloud], small: tuple[Cloud, Cloud], width: Array, config: Search) -> Rigid:
+def _from_features(
+    clouds: tuple[Prepared, Prepared], small: tuple[Cloud, Cloud], width: Array, config: Search
+) -> Rigid:
     features = []
     for cloud, part in zip(clouds, small, strict=True):
-        dense = thin(cloud, _NORMAL_POINTS)
-        surface = normals(part.points, dense, config.normal_radius * width, centroid(cloud))
+        dense = cloud.thin(_NORMAL_POINTS)
+        surface = normals(part.points, dense, config.normal_radius * width, centroid(cloud.cloud))
         features.append(fpfh(part, surface, config.feature_radius * width))
     matches = match_features(*features, *(part.mask for part in small))
     count = min(config.matches, small[0].points.shape[0])
@@ -95,7 +103,8 @@ def _from_features(clouds: tuple[Cloud, Cloud], small: tuple[Cloud, Cloud], widt
 
 def _from_network(model: Model, source: Cloud, target: Cloud, rotations: int) -> Rigid:
     """The network's estimates, with the source turned by every member of the cover."""
-    source, target = (subsample(cloud, model.config.points) for cloud in (source, target))
+    # Farthest-point samples: their first points are a coarser one.
+    source, target = (jax.tree.map(lambda leaf: leaf[: model.config.points], cloud) for cloud in (source, target))
 
     def at(rotation: Array) -> Rigid:
         start = Rigid(rotation, jnp.zeros(3))

@@ -1,0 +1,236 @@
+"""What is said of an alignment: overlap, inliers, information and how sure it is, against their definitions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from urrt_jax.assessment import (
+    Fit,
+    cross_matrix,
+    fit,
+    information,
+    inlier_share,
+    moved_information,
+    well_posed,
+)
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import Cloud, centroid, make_cloud, shift
+from urrt_jax.geometry.prepared import prepare
+from urrt_jax.geometry.rigid import Rigid
+
+_fit = jax.jit(fit)
+_ROWS = 900  # all clouds are padded to it, so that one program is compiled
+
+
+def _padded(points: np.ndarray) -> Cloud:
+    values = np.full((_ROWS, 3), 9.0, np.float32)
+    values[: len(points)] = points
+    return make_cloud(values, np.arange(_ROWS) < len(points))
+
+
+def _sheet(start: float, stop: float) -> Cloud:
+    """A plane's grid with one point in each square of 0.1, from ``start`` to ``stop`` along x and over 2 along y."""
+    x, y = np.meshgrid(np.arange(start + 0.05, stop, 0.1), np.arange(0.05, 2, 0.1))
+    return _padded(np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))
+
+
+def _turn(degrees: float) -> Rigid:
+    return Rigid(jnp.asarray(Rotation.from_euler("y", degrees, degrees=True).as_matrix(), jnp.float32), jnp.zeros(3))
+
+
+def test_overlap_of_half_overlapping_planes_is_a_half_of_each():
+    overlap = _fit(_sheet(0, 2), _sheet(1, 3), rigid.identity()).overlap
+    np.testing.assert_allclose(overlap, [0.55, 0.55], atol=0.01)  # one more column of twenty touches
+
+
+def test_overlap_of_a_part_is_all_of_it_and_a_half_of_the_whole():
+    overlap = _fit(_sheet(0, 1), _sheet(0, 2), rigid.identity()).overlap
+    np.testing.assert_allclose(overlap, [1, 0.55], atol=0.01)
+
+
+def test_overlap_of_clouds_far_apart_is_nothing():
+    far = Rigid(jnp.eye(3), jnp.array([0.0, 0.0, 50.0]))
+    assert _fit(_sheet(0, 2), _sheet(1, 3), far).shares.tolist() == [[0] * 3] * 2
+
+
+def test_shares_grow_with_their_distances(cloud):
+    shares = _fit(_padded(cloud), _padded(cloud + np.float32(0.05)), _turn(10)).shares
+    assert bool(jnp.all(jnp.diff(shares, axis=1) > 0))
+
+
+def test_swapping_the_clouds_swaps_the_shares(cloud):
+    source, target, transform = _padded(cloud[::2]), _padded(cloud[50:]), _turn(5)
+    swapped = _fit(target, source, rigid.inverse(transform))
+    np.testing.assert_allclose(swapped.shares, _fit(source, target, transform).shares[::-1], atol=1e-6)
+
+
+def test_squared_distances_are_those_of_the_nearest_and_infinite_for_padding(cloud):
+    source, target, transform = _padded(cloud[::2]), _padded(cloud[50:]), _turn(5)
+    found = _fit(source, target, transform)
+    apart = rigid.apply(transform, source.points) - target.points[found.nearest]
+    expected = np.where(source.mask, np.sum(np.square(apart), axis=1), np.inf)
+    np.testing.assert_allclose(found.squared, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_prepared_clouds_change_nothing(cloud):
+    source, target = _padded(cloud[::2]), _padded(cloud[50:])
+    prepared = _fit(*(jax.jit(prepare)(each) for each in (source, target)), _turn(5))
+    jax.tree.map(np.testing.assert_array_equal, prepared, _fit(source, target, _turn(5)))
+
+
+def test_padding_changes_nothing(cloud):
+    source, target = make_cloud(cloud), make_cloud(cloud + np.float32(0.03))
+    padded = _fit(_padded(source.points), _padded(target.points), _turn(5))
+    np.testing.assert_allclose(_fit(source, target, _turn(5)).shares, padded.shares, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_confidence_in_another_sample_of_the_surface_is_high(make_cloud_points, seed):
+    source, target = (_padded(make_cloud_points(each, 4)) for each in (seed, seed + 10))
+    assert float(_fit(source, target, rigid.identity()).confidence) > 0.6
+
+
+def test_confidence_in_the_same_points_is_nearly_one(make_cloud_points):
+    points = make_cloud_points(0, 4)
+    noise = np.random.default_rng(0).normal(scale=0.005, size=points.shape)
+    assert float(_fit(_padded(points), _padded(points + noise), rigid.identity()).confidence) > 0.99
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("degrees", [-40, 40])
+def test_confidence_in_a_cloud_turned_about_its_centre_is_low(make_cloud_points, axis, degrees):
+    points = make_cloud_points(0, 4)
+    points = points - points.mean(axis=0)
+    turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    wrong = Rigid(jnp.asarray(turn, jnp.float32), jnp.zeros(3))
+    assert float(_fit(_padded(points), _padded(points), wrong).confidence) < 0.1
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_confidence_is_a_probability_where_nothing_and_where_all_is_near(share):
+    confidence = float(Fit(jnp.zeros(1), jnp.zeros(1, int), jnp.ones(()), jnp.full((2, 3), share)).confidence)
+    assert (0 <= confidence < 1e-3) if share == 0 else (0.99 < confidence <= 1)
+
+
+def test_confidence_in_an_empty_cloud_is_nothing(cloud):
+    assert float(_fit(_padded(cloud), _padded(cloud[:0]), rigid.identity()).confidence) < 1e-3
+
+
+def test_inlier_share_and_rmse_are_those_of_real_points_within_reach():
+    squared = jnp.array([0.0, 1.0, 4.0, 4.0001, 1e9, jnp.inf, 1.0, 0.0])
+    mask = jnp.arange(8) < 6
+    share, rmse = inlier_share(mask, squared, jnp.float32(2))
+    assert float(share) == pytest.approx(3 / 6)
+    assert float(rmse) == pytest.approx(np.sqrt(5 / 3))
+
+
+@pytest.mark.parametrize(("real", "squared"), [(0, 1.0), (3, 9.0)])
+def test_inlier_share_and_rmse_of_no_inliers_are_zero(real, squared):
+    assert [float(each) for each in inlier_share(jnp.arange(5) < real, jnp.full(5, squared), jnp.float32(2))] == [0, 0]
+
+
+@pytest.mark.parametrize("squared", [0.0, 9.0, np.inf])
+def test_derivative_of_the_rmse_is_finite(squared):
+    gradient = jax.grad(lambda each: inlier_share(jnp.ones(5, bool), each, jnp.float32(2))[1])(jnp.full(5, squared))
+    assert np.isfinite(gradient).all()
+
+
+_POINTS = np.random.default_rng(0).normal([1.0, -2.0, 0.5], size=(30, 3))
+_INLIER = np.arange(30) % 3 > 0
+
+
+def _summed(points: np.ndarray, inlier: np.ndarray) -> np.ndarray:
+    """Σ GᵀG with G = [I, −[q]×], where [q]× p = q × p, by the definition."""
+    total = np.zeros((6, 6))
+    for q in points[inlier]:
+        g = np.concatenate([np.eye(3), -np.cross(q, np.eye(3)).T], axis=1)
+        total += g.T @ g
+    return total
+
+
+@pytest.mark.parametrize("inlier", [_INLIER, np.ones(30, bool), np.zeros(30, bool)], ids=["some", "all", "none"])
+def test_information_is_the_sum_of_its_definition(inlier):
+    found = information(jnp.asarray(_POINTS, jnp.float32), inlier)
+    np.testing.assert_allclose(found, _summed(_POINTS, inlier), rtol=1e-5, atol=1e-4)
+
+
+def test_information_is_how_the_squared_distance_grows_with_a_motion():
+    """To first order the points q move by t + ω × q."""
+    motion = np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.6])
+    moved = motion[:3] + np.cross(motion[3:], _POINTS[_INLIER])
+    matrix = information(jnp.asarray(_POINTS, jnp.float32), _INLIER)
+    assert float(motion @ matrix @ motion) == pytest.approx(np.sum(moved**2), rel=1e-5)
+
+
+def test_values_of_outliers_do_not_reach_the_information():
+    strange = np.where(_INLIER[:, None], _POINTS, np.nan).astype(np.float32)
+    np.testing.assert_allclose(information(strange, _INLIER), _summed(_POINTS, _INLIER), rtol=1e-5, atol=1e-4)
+
+
+_OFFSET = np.array([0.7, -1.5, 2.0])
+
+
+def test_moved_information_is_that_of_the_moved_points():
+    matrix = information(jnp.asarray(_POINTS, jnp.float32), _INLIER)
+    moved = jax.jit(moved_information)(matrix, jnp.asarray(_OFFSET, jnp.float32))
+    np.testing.assert_allclose(moved, _summed(_POINTS + _OFFSET, _INLIER), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e6])
+def test_moved_information_by_a_numpy_offset_keeps_its_digits(scale):
+    moved = moved_information(_summed(_POINTS, _INLIER), scale * _OFFSET)
+    assert moved.dtype == np.float64
+    expected = _summed(_POINTS + scale * _OFFSET, _INLIER)
+    np.testing.assert_allclose(moved, expected, rtol=1e-12, atol=1e-12 * scale**2)
+
+
+def test_moved_information_of_a_jax_matrix_by_a_numpy_offset_is_float64():
+    matrix = information(jnp.asarray(_POINTS, jnp.float32), _INLIER)
+    assert moved_information(matrix, _OFFSET).dtype == np.float64
+
+
+def test_moved_information_is_traceable_with_a_numpy_offset():
+    matrix = information(jnp.asarray(_POINTS, jnp.float32), _INLIER)
+    traced = jax.jit(lambda each: moved_information(each, _OFFSET))(matrix)
+    np.testing.assert_allclose(traced, moved_information(matrix, _OFFSET), rtol=1e-5)
+
+
+@pytest.mark.parametrize("arrays", [np, jnp])
+def test_cross_matrix_is_the_cross_product_from_the_left(arrays):
+    matrix = cross_matrix(arrays.asarray([1.0, -2.0, 3.0]))
+    assert isinstance(matrix, np.ndarray) == (arrays is np)
+    np.testing.assert_array_equal(matrix @ np.array([4.0, 5.0, -6.0]), np.cross([1.0, -2.0, 3.0], [4.0, 5.0, -6.0]))
+
+
+_LINE = np.outer(np.linspace(-1, 1, 30), [0.3, -0.5, 0.8])
+_TRIANGLE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("points", "expected"),
+    [
+        pytest.param(_TRIANGLE, True, id="three points"),
+        pytest.param(1e-5 * _TRIANGLE, True, id="three points, tiny"),
+        pytest.param(1e5 * _TRIANGLE, True, id="three points, large"),
+        pytest.param(_TRIANGLE * [1, 0.01, 1], True, id="a flat triangle"),
+        pytest.param(_TRIANGLE[[0, 1, 1]], False, id="two points, one twice"),
+        pytest.param(_TRIANGLE[:2], False, id="two points"),
+        pytest.param(np.ones((5, 3)), False, id="coincident points"),
+        pytest.param(_LINE, False, id="a line"),
+        pytest.param(_LINE[:3], False, id="three points on a line"),
+        pytest.param(100 + _LINE, False, id="a line far away"),
+        pytest.param(np.outer(np.linspace(-1, 1, 30), [0, 1, 0]), False, id="a line along an axis"),
+        pytest.param(np.concatenate([_LINE, [[0.02, 0.0, 0.0]]]), True, id="a line and one point beside it"),
+        pytest.param(np.random.default_rng(0).uniform(-1, 1, (30, 3)) * [1, 1, 0], True, id="a plane"),
+    ],
+)
+def test_well_posed_is_what_determines_a_rotation(points, expected):
+    cloud = make_cloud(jnp.asarray(points, jnp.float32))
+    assert bool(well_posed(shift(cloud, centroid(cloud)))) == expected
+
+
+def test_padding_does_not_make_a_cloud_well_posed():
+    cloud = make_cloud(jnp.asarray(_TRIANGLE - _TRIANGLE.mean(axis=0), jnp.float32), np.arange(3) < 2)
+    assert not bool(well_posed(cloud))

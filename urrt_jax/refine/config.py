@@ -1,0 +1,53 @@
+"""How to refine."""
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ICP:
+    """How to refine. Lengths are relative to the clouds, so that units do not matter.
+
+    Attributes:
+      coarse_points: points of the source in the first stage, which looks for the basin, point to point; twice as many
+        of the target. 0 skips that stage.
+      coarse_iterations: its iterations at most.
+      reach: the first stage's weights fall to a quarter at this distance, in units of the clouds' radius; it shrinks
+        from here to the spacing.
+      points: points of each cloud that look for their neighbour in all of the other one, in the second stage.
+      iterations: its iterations at most.
+      inlier_distance: the second stage's weights fall to a quarter at this many spacings of the coarser cloud, after
+        they have shrunk from the first stage's spacing.
+      plane: 1 measures distances to the neighbour's tangent plane, 0 to the neighbour; between them both count. Planes
+        let samples of one surface slide on each other; points hold where planes don't.
+      normal_radius: of the neighbourhood of a normal, in spacings.
+      mutual: only pairs count that are each other's nearest, as far as the chosen points go.
+      trim: only the nearest pairs count, as many as the overlap is estimated to hold.
+      tolerance: a stage has converged when a step turns by less than this (radians) and moves by less than this share
+        of the clouds' radius.
+    """
+
+    coarse_points: int = 256
+    coarse_iterations: int = 30
+    reach: float = 0.4
+    points: int = 2048
+    iterations: int = 80
+    inlier_distance: float = 1.0
+    plane: float = 0.97
+    normal_radius: float = 3.0
+    mutual: bool = False
+    trim: bool = False
+    tolerance: float = 5e-5
+
+    def __post_init__(self) -> None:
+        for name, least in (("coarse_points", 0), ("coarse_iterations", 1), ("points", 3), ("iterations", 1)):
+            if type(getattr(self, name)) is not int:
+                raise ValueError(f"{name}: expected a whole number, got {getattr(self, name)!r}")
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        for name in ("reach", "inlier_distance", "normal_radius", "tolerance"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0 < value < math.inf):
+                raise ValueError(f"{name}: expected a positive number, got {value!r}")
+        if not (isinstance(self.plane, int | float) and 0 <= self.plane <= 1):
+            raise ValueError(f"plane: expected a share from 0 to 1, got {self.plane!r}")
