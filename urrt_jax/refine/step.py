@@ -11,7 +11,7 @@ from urrt_jax.refine.pairs import Pairs
 
 _HIGHEST = jax.lax.Precision.HIGHEST
 _DAMPING = 1e-6  # of the matrix's mean diagonal: motions that no pair speaks for are not made
-_LEAST_DAMPING = 1e-12  # where there is no pair at all: what is divided by it stays finite
+_LEAST_DAMPING = 1e-30  # where there is no pair at all: what is divided by it stays finite
 _LONGEST = 0.3  # radians and radii, one step
 
 
