@@ -256,6 +256,29 @@ def test_matrix_transform_and_apply_agree(plain, cloud, target):
     np.testing.assert_allclose(plain.transform.apply(jnp.asarray(cloud)), plain.apply(cloud), atol=1e-5)
 
 
+def test_correspondences_are_the_nearest_points_within_the_inlier_distance(small_model, cloud, target):
+    half = target[:100]
+    result = register(cloud, half, model=small_model)
+    distance, row = cKDTree(half).query(result.apply(cloud))
+    inlier = distance < float(result.inlier_distance)
+    assert 0 < inlier.sum() < len(cloud)
+    np.testing.assert_array_equal(result.correspondences, np.where(inlier, row, -1))
+    assert float(result.fitness) == pytest.approx(inlier.mean())
+
+
+@pytest.mark.parametrize("origin", [0.0, 5e5], ids=["near", "map coordinates"])
+def test_information_is_about_the_origin_of_the_targets_own_frame(small_model, cloud, target, origin):
+    """Against the sum of GᵀG over the corresponding target points, which float64 carries far from the origin too."""
+    goal = target.astype(np.float64) + origin * np.array([1.0, -2.0, 0.5])
+    result = register(cloud.astype(np.float64), goal, model=small_model)
+    rows = np.asarray(result.correspondences)
+    expected = np.zeros((6, 6))
+    for x, y, z in goal[rows[rows >= 0]]:
+        jacobian = np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+        expected += jacobian.T @ jacobian
+    np.testing.assert_allclose(result.information, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+
+
 def test_swapping_the_clouds_gives_the_inverse(call, cloud, target, plain):
     back = call(target, cloud)
     np.testing.assert_allclose(back.matrix @ plain.matrix, np.eye(4), atol=1e-3)

@@ -11,7 +11,8 @@ from urrt_jax.reproduce import as_markdown, find_experiment
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
 TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond")
-FILES = (*(f"{name}/results.json" for name in (*TABLES, "figure4_qualitative", "confidence")), "benchmarks/speed.json")
+ALSO = ("figure4_qualitative", "confidence", "regions")
+FILES = (*(f"{name}/results.json" for name in (*TABLES, *ALSO)), "benchmarks/speed.json")
 README = (ROOT / "README.md").read_text()
 
 
@@ -80,6 +81,12 @@ def test_confidence_tells_right_poses_from_wrong_ones():
     area = {row["pairs_of"]: row["auc"] for row in load("confidence")["rows"]}
     assert area["all"] >= 0.95
     assert area["real scans"] >= 0.95
+
+
+def test_regions_are_used_and_the_same_in_both_clouds():
+    numbers = load("regions")["numbers"]
+    assert numbers["consistency in the last step"] >= 0.8
+    assert numbers["regions with more than 1 % of all points"] >= 5
 
 
 def test_readme_shows_the_training_command():

@@ -18,7 +18,9 @@ _RINGS = (1.0, 1.5, 3.0)  # spacings of the coarser cloud: close, touching (samp
 _CLOSE, _TOUCHING, _ABOUT = range(3)
 _ASKED = 4096  # points of a large target
 ASSESSED = {"overlap": 4.1, "tightness": 7.7, "closeness": 9.2}
-"""What confidence is made of, and the weights: a logistic regression on training shapes (experiments/confidence)."""
+"""What confidence is made of, and the weights: a logistic regression on training shapes.
+
+``experiments/confidence`` fits it again, to another draw of them, and measures these."""
 BIAS = -16.1
 
 

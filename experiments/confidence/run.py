@@ -1,18 +1,19 @@
 """How well `Registration.confidence` tells right poses from wrong ones, and how its four numbers are fitted.
 
-    python experiments/confidence/run.py --data PATH
+    python experiments/confidence/run.py --data PATH [--fit]
 
 The numbers are a logistic regression on training shapes: pairs of the hard protocols as they are, the same pairs turned
 by any rotation (which the network mostly misses), and searched ones. The packaged ones were fitted to an earlier draw
-of such pairs; "regression" in the results is this run's, which ranks poses nearly alike. The curves are of test shapes
-and real scans that no number was fitted to. A pose is right within 5° and 0.1 (scans: 0.05 diagonals). Writes
-results.json, table.md and roc.png beside this file.
+of such pairs, by an earlier network; "regression" in the results is this run's, and "left out" says which of the two to
+prefer: the mean log loss on each protocol, of a regression on the others, and of the packaged numbers. With --fit only
+these are found, and printed. The curves are of test shapes and real scans that no number was fitted to. A pose is right
+within 5° and 0.1 (scans: 0.05 diagonals). Writes results.json, table.md and roc.png beside this file.
 """
 
 import argparse
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from urrt_jax import Search, load_model, model_card, pad_clouds, register
-from urrt_jax.assessment import ASSESSED, fit
+from urrt_jax.assessment import ASSESSED, BIAS, fit
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import Trial, find_protocol, load_scan_pairs, pose_errors, roc_curve
 from urrt_jax.geometry.clouds import make_cloud, normalize_pair, normalize_translation
@@ -36,6 +37,7 @@ PROTOCOLS = ("incomplete_both", "outliers share=0.2", "independent_noise", "prne
 SUBSET = "modelnet40_2048_normals_subset.npz"
 SCANS = "bunny_scans.npz"
 PAIRS, SEARCHED = 80, 40
+RIDGE = 3e-4
 BLOCK = 16_384
 
 
@@ -115,20 +117,34 @@ def measure(model: Model, data: str, split: Literal["train", "test"]) -> dict[st
             answers(model, anyhow, None, 0.1, 40),
             answers(model, anyhow[:: PAIRS // SEARCHED], Search(), 0.1, 8),
         ]
-        found[protocol] = Answers(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        found[protocol] = together(parts)
     return found
 
 
-def regress(found: dict[str, Answers]) -> np.ndarray:
-    """The logistic regression of right against wrong: bias and one weight for each of ``ASSESSED``."""
-    told_by = np.concatenate([each.told_by for each in found.values()])
-    right = np.concatenate([each.right for each in found.values()])
+def log_loss(weights: np.ndarray, found: Answers) -> float:
+    """Of right against wrong, under a bias and one weight for each of ``ASSESSED``."""
+    logit = found.told_by @ weights[1:] + weights[0]
+    return float(np.mean(np.logaddexp(0, np.where(found.right, -logit, logit))))
 
-    def loss(weights: np.ndarray) -> float:
-        logit = told_by @ weights[1:] + weights[0]
-        return float(np.mean(np.logaddexp(0, np.where(right, -logit, logit))) + 1e-4 * np.sum(weights[1:] ** 2))
 
-    return minimize(loss, np.zeros(1 + len(ASSESSED))).x
+def regress(found: list[Answers]) -> np.ndarray:
+    """The logistic regression: bias and one weight for each of ``ASSESSED``."""
+    every = together(found)
+    return minimize(lambda x: log_loss(x, every) + RIDGE * np.sum(x[1:] ** 2), np.zeros(1 + len(ASSESSED))).x
+
+
+def left_out(found: dict[str, Answers]) -> dict[str, float]:
+    """The mean log loss on each protocol, of regressions on the others and of the packaged numbers."""
+    packaged = np.array([BIAS, *ASSESSED.values()])
+    others = {name: regress([each for other, each in found.items() if other != name]) for name in found}
+    return {
+        "regressions": float(np.mean([log_loss(others[name], each) for name, each in found.items()])),
+        "packaged": float(np.mean([log_loss(packaged, each) for each in found.values()])),
+    }
+
+
+def together(found: Iterable[Answers]) -> Answers:
+    return Answers(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
@@ -185,19 +201,25 @@ def as_markdown(results: dict) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", required=True, help="ModelNet40, with the subset and the scans beside it")
+    parser.add_argument("--fit", action="store_true", help="only fit the numbers, and print them")
     flags = parser.parse_args()
     model = load_model()
-    weights = regress(measure(model, flags.data, "train"))
+    training = measure(model, flags.data, "train")
+    weights = dict(zip(("bias", *ASSESSED), np.round(regress(list(training.values())), 1).tolist(), strict=True))
+    fitted = {"regression": weights, "left out": left_out(training)}
+    if flags.fit:
+        print(json.dumps(fitted))
+        raise SystemExit
     test = measure(model, flags.data, "test")
     scans, _ = load_scan_pairs(Path(flags.data) / SCANS)
     parts = [answers(model, scans, search, 0.05, 1) for search in (None, Search())]
-    test["real scans"] = Answers(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-    test["all"] = Answers(*(np.concatenate(each) for each in zip(*test.values(), strict=True)))
+    test["real scans"] = together(parts)
+    test["all"] = together(test.values())
     results = {
         "command": f"python experiments/confidence/run.py --data {Path(flags.data).name}",
         "model_sha256": model_card()["sha256"],
         "jax": jax.__version__,
-        "regression": dict(zip(("bias", *ASSESSED), np.round(weights, 1).tolist(), strict=True)),
+        **fitted,
         "rows": [as_row(name, found) for name, found in test.items()],
     }
     (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")

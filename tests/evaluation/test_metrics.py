@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from urrt_jax.evaluation import euler_angles, pose_errors, recall_curve, rotation_degrees, summarize
+from urrt_jax.evaluation import euler_angles, pose_errors, recall_curve, roc_curve, rotation_degrees, summarize
 from urrt_jax.evaluation.metrics import clean_chamfer, true_overlap
 from urrt_jax.geometry.rigid import Rigid
 
@@ -121,3 +121,29 @@ def test_overlap_is_the_share_with_a_counterpart():
     source = jnp.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
     target = jnp.array([[5.0, 0.05, 0], [6, 0, 0.05]])
     assert float(true_overlap(source, target, rigid(np.eye(3), [5.0, 0, 0]), 0.1)) == 0.5
+
+
+def test_area_under_the_curve_is_the_chance_that_a_right_pose_is_surer():
+    """Against its definition, over all pairs of a right and a wrong pose; confidences are few, so that many tie."""
+    rng = np.random.default_rng(0)
+    right, confidence = rng.random(60) < 0.4, rng.integers(0, 6, 60) / 5
+    surer = np.sign(confidence[right][:, None] - confidence[~right])
+    assert roc_curve(right, confidence)[2] == pytest.approx(np.mean((surer + 1) / 2), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("confidence", "area"), [([0.9, 0.8, 0.2, 0.1], 1), ([0.1, 0.2, 0.8, 0.9], 0), ([0.5] * 4, 0.5)]
+)
+def test_area_under_the_curve_of_a_perfect_a_reversed_and_a_blind_confidence(confidence, area):
+    assert roc_curve(np.array([True, True, False, False]), np.array(confidence))[2] == area
+
+
+def test_roc_curve_goes_from_none_to_all():
+    wrong, right, _ = roc_curve(np.array([True, False, True, False]), np.array([0.9, 0.6, 0.6, 0.1]))
+    np.testing.assert_array_equal(wrong, [0, 0, 0.5, 1])
+    np.testing.assert_array_equal(right, [0, 0.5, 1, 1])
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_area_under_the_curve_is_not_known_where_all_poses_are_alike(right):
+    assert np.isnan(roc_curve(np.full(5, right), np.linspace(0, 1, 5))[2])

@@ -243,6 +243,18 @@ def test_procrustes_ignores_pairs_of_weight_zero():
     _close(found, Rigid(turn, shift), atol=1e-5)
 
 
+def test_stiffness_turns_nothing_that_is_smaller_and_hardly_what_is_larger():
+    points, turn = np.random.default_rng(0).normal(size=(20, 3)), Rotation.from_rotvec([0.3, -0.4, 0.5]).as_matrix()
+
+    def found(scale: float, stiffness: float) -> jax.Array:
+        clouds = (jnp.asarray(scale * x, jnp.float32) for x in (points, points @ turn.T))
+        return procrustes(*clouds, jnp.ones(20), stiffness=stiffness).rotation
+
+    np.testing.assert_allclose(found(1e-3, 0.0), turn, atol=1e-5)
+    np.testing.assert_allclose(found(1e-3, 1e-2), np.eye(3), atol=1e-3)
+    np.testing.assert_allclose(found(1.0, 1e-4), turn, atol=1e-3)
+
+
 def test_procrustes_without_weight_is_the_identity():
     source, target, _, _ = _problem(1)
     _close(procrustes(jnp.float32(source), jnp.float32(target), jnp.zeros(20)), rigid.identity(), atol=0)

@@ -6,15 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import make_cloud, normalize_pair
 from urrt_jax.model import Model, ModelConfig, estimate, init_model
 from urrt_jax.model.attention import attention_weights
-from urrt_jax.model.decoder import fuse, fusion_weights
 from urrt_jax.model.encoder import shape_embedding
 from urrt_jax.model.network import encode, point_regions, predict
 from urrt_jax.model.partition import (
@@ -44,9 +40,10 @@ def _close(first, second, atol=1e-5):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), first, second)
 
 
-@pytest.fixture(scope="module", params=["A", "B", "C"])
+@pytest.fixture(scope="module", params=[("A", "landmarks"), ("B", "pose"), ("C", "landmarks")], ids="-".join)
 def model(request, small_config, make_model) -> Model:
-    return make_model(dataclasses.replace(small_config, variant=request.param))
+    variant, decoder = request.param
+    return make_model(dataclasses.replace(small_config, variant=variant, decoder=decoder))
 
 
 @pytest.fixture(scope="module")
@@ -290,34 +287,6 @@ def test_empty_cloud_leaves_the_answer_finite(model, pair):
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(answer))
 
 
-def test_fusion_weighs_regions_by_their_points():
-    weights = fusion_weights(jnp.array([10.0, 20, 30]), jnp.array([20.0, 20, 0]))
-    np.testing.assert_allclose(weights, [30 / 70, 40 / 70, 0], atol=1e-6)
-
-
-def test_fusion_without_a_shared_region_falls_back_to_counts():
-    weights = fusion_weights(jnp.array([10.0, 0]), jnp.array([0.0, 30]))
-    np.testing.assert_allclose(weights, [0.25, 0.75], atol=1e-6)
-
-
-def test_fusion_of_nothing_is_finite():
-    np.testing.assert_array_equal(fusion_weights(jnp.zeros(3), jnp.zeros(3)), 0)
-
-
-@given(st.integers(0, 2**31 - 1))
-def test_fusion_gives_a_rotation(seed):
-    rng = np.random.default_rng(seed)
-    codes = jnp.asarray(rng.normal(size=(4, 9)), jnp.float32)
-    _is_rotation(fuse(codes, jnp.asarray(rng.dirichlet(np.ones(4)), jnp.float32)).rotation, atol=1e-4)
-
-
-def test_fusion_of_equal_transforms_is_that_transform():
-    turn = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
-    code = np.concatenate([turn[:, 0], turn[:, 1], [1, 2, 3]]).astype(np.float32)
-    fused = fuse(jnp.tile(code, (3, 1)), jnp.array([0.2, 0.5, 0.3]))
-    _close(fused, rigid.Rigid(turn, np.array([1.0, 2, 3])), atol=1e-6)
-
-
 def test_labels_are_regions(small_model, pair):
     cloud = make_cloud(pair[0])
     logits = branch_logits(small_model.config, small_model.params["partition"], cloud.points, jnp.zeros(16))
@@ -417,6 +386,9 @@ def test_shape_embedding_of_an_empty_cloud_is_zero():
     ("fields", "says"),
     [
         ({"variant": "D"}, "^variant: .*'D'"),
+        ({"decoder": "9D"}, "^decoder: .*'9D'"),
+        ({"landmarks": 0}, "^landmarks: .*0"),
+        ({"key_width": 1.5}, "^key_width: .*1.5"),
         ({"regions": 0}, "^regions: .*0"),
         ({"width": -1}, "^width: .*-1"),
         ({"steps": 0}, "^steps: .*0"),
@@ -434,6 +406,8 @@ def test_config_refuses_and_names_the_field(fields, says):
     "fields",
     [
         {"regions": 1},
+        {"landmarks": 1},
+        {"key_width": 1},
         {"attention_layers": 0},
         {"variant": "B", "attention_layers": 0},
         {"encoder_widths": ()},

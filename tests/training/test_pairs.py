@@ -112,6 +112,14 @@ def test_either_cloud_may_be_the_posed_one(corrupted):
     assert 0.2 < np.mean(source < target) < 0.8
 
 
+@pytest.mark.parametrize(("both_ways", "still"), [(0.0, "source"), (1.0, "target")])
+def test_only_one_cloud_is_posed_where_asked(cloud, both_ways, still):
+    shape = jnp.asarray(cloud)
+    pair = jax.vmap(lambda key: make_pair(key, shape, PairConfig(points=200, both_ways=both_ways), 0.0))(_KEYS[:8])
+    for points in np.asarray(getattr(pair, still).points):
+        np.testing.assert_allclose(np.sort(points, axis=0), np.sort(cloud, axis=0), atol=1e-6)
+
+
 @pytest.mark.parametrize("max_angle", [0.0, 10.0, 45.0])
 @pytest.mark.parametrize("signed", [0.0, 1.0])
 def test_angles_and_translations_stay_in_their_ranges(max_angle, signed):

@@ -28,6 +28,8 @@ class NetworkFlags:
         regions: Regions that the network cuts a cloud into.
         width: Dimension of the embeddings.
         attention_layers: Self-attention layers over the regions.
+        decoder: What a region's decoder gives: landmarks to align, or the pose itself.
+        landmarks: Landmarks of a region.
         steps: How often the network is applied, each time to the source as moved so far.
         points: Points of a cloud that the network looks at.
     """
@@ -36,6 +38,8 @@ class NetworkFlags:
     regions: int = 8
     width: int = 128
     attention_layers: int = 1
+    decoder: Literal["landmarks", "pose"] = "landmarks"
+    landmarks: int = 8
     steps: int = 3
     points: int = 512
 
@@ -49,6 +53,7 @@ class PairFlags:
         max_angle: Largest rotation about each axis, in degrees.
         signed: Share of pairs whose angles take random signs; the others turn one way only, as in DCP's protocol.
         translation: Largest translation along each axis.
+        both_ways: Share of pairs whose source is the turned cloud; in the others it is the target, as in DCP's.
         clean_share: First share of the steps in which all pairs are clean; that learns faster.
         ramp_share: Share of the steps in which spoiled pairs come in.
         corrupted: Share of pairs that are spoiled after that.
@@ -61,6 +66,7 @@ class PairFlags:
     max_angle: float = 45.0
     signed: float = 0.5
     translation: float = 0.5
+    both_ways: float = 0.5
     clean_share: float = 0.3
     ramp_share: float = 0.1
     corrupted: float = 0.75

@@ -26,9 +26,14 @@ class Neighbors(NamedTuple):
     squared: Array
 
 
-def searchable(cloud: Cloud) -> Cloud | Blocks:
-    """What to hand to ``nearest`` when it is asked again and again: a large cloud's blocks, a small cloud itself."""
-    return make_blocks(cloud) if cloud.points.shape[0] > LARGE else cloud
+def searchable(cloud: Cloud, order: Array | None = None) -> Cloud | Blocks:
+    """What to hand to ``nearest`` when it is asked again and again: a large cloud's blocks, a small cloud itself.
+
+    Args:
+      cloud: M points.
+      order: ``curve_order`` of them, where it is at hand.
+    """
+    return make_blocks(cloud, order) if cloud.points.shape[0] > LARGE else cloud
 
 
 def nearest(

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.blocks import Blocks, make_blocks
+from urrt_jax.geometry.blocks import Blocks
 from urrt_jax.geometry.clouds import Cloud, thin
 from urrt_jax.geometry.curve import curve_order
-from urrt_jax.geometry.neighbors import LARGE, spacing
+from urrt_jax.geometry.neighbors import searchable, spacing
 
 _ASKED = 1024  # points at which the spacing of a large cloud is asked
 _LEAST_SPACING = 1e-6  # of clouds whose points all coincide
@@ -38,8 +38,7 @@ def prepare(cloud: Cloud | Prepared) -> Prepared:
     """The cloud prepared; one that is already is returned as it is."""
     if isinstance(cloud, Prepared):
         return cloud
-    size = cloud.points.shape[0]
-    order = curve_order(cloud.points, cloud.mask) if size > _ASKED else None
-    reference = make_blocks(cloud, order) if order is not None and size > LARGE else cloud
+    order = curve_order(cloud.points, cloud.mask) if cloud.points.shape[0] > _ASKED else None
+    reference = searchable(cloud, order)
     width = spacing(reference, sample=thin(cloud, _ASKED, order=order))
     return Prepared(cloud, order, reference, jnp.maximum(width, _LEAST_SPACING))

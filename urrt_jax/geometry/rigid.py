@@ -131,13 +131,15 @@ def _polar(moment: Array) -> tuple[Array, Array, Array]:
     return rotation, right.T, stretch * signs
 
 
-def procrustes(source: Array, target: Array, weights: Array) -> Rigid:
+def procrustes(source: Array, target: Array, weights: Array, *, stiffness: float = 0.0) -> Rigid:
     """The rigid transform that minimises Σ wᵢ ‖R sᵢ + t − tᵢ‖² (Kabsch 1976; Umeyama 1991 without scale).
 
     Args:
       source: (N, 3).
       target: (N, 3), row by row the counterparts of ``source``.
       weights: (N,) non-negative; zero leaves a pair out, and an all-zero vector gives the identity.
+      stiffness: a small area that is added to the moment's diagonal: pairs that spread over less than it, in any
+        direction, are not turned about the others.
     """
     chex.assert_equal_shape([source, target])
     chex.assert_shape(weights, source.shape[:1])
@@ -146,6 +148,7 @@ def procrustes(source: Array, target: Array, weights: Array) -> Rigid:
     source_mean = jnp.matmul(share, source, precision=_HIGHEST)
     target_mean = jnp.matmul(share, target, precision=_HIGHEST)
     moment = jnp.einsum("n,ni,nj->ij", share, target - target_mean, source - source_mean, precision=_HIGHEST)
-    rotation = nearest_rotation(jnp.where(total > 0, moment, jnp.eye(3, dtype=moment.dtype)))
+    still = jnp.eye(3, dtype=moment.dtype)
+    rotation = nearest_rotation(jnp.where(total > 0, moment + stiffness * still, still))
     translation = jnp.where(total > 0, target_mean - rotate(rotation, source_mean), jnp.zeros_like(target_mean))
     return Rigid(rotation, translation)

@@ -4,6 +4,8 @@ import dataclasses
 import json
 from typing import Literal
 
+from urrt_jax.checks import check_whole
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelConfig:
@@ -18,7 +20,11 @@ class ModelConfig:
       branch_width: hidden width of every region branch h_k.
       position_widths: hidden widths of the position encoding δ.
       attention_layers: self-attention layers over the regions.
+      decoder: what the decoders g_k give. "landmarks": the places of ``landmarks`` matching landmarks in both clouds,
+        which are then aligned. "pose": the transform itself, regressed.
       decoder_widths: hidden widths of every decoder g_k.
+      landmarks: landmarks of a region.
+      key_width: dimension in which landmarks and points are compared.
       steps: K, how often the network is applied, each time to the source moved by the estimate so far.
       points: points of a cloud that the network looks at; larger clouds are subsampled (``subsample``).
     """
@@ -30,23 +36,20 @@ class ModelConfig:
     branch_width: int = 32
     position_widths: tuple[int, ...] = (64,)
     attention_layers: int = 1
+    decoder: Literal["landmarks", "pose"] = "landmarks"
     decoder_widths: tuple[int, ...] = (128,)
+    landmarks: int = 8
+    key_width: int = 32
     steps: int = 3
     points: int = 512
 
     def __post_init__(self) -> None:
         if self.variant not in ("A", "B", "C"):
             raise ValueError(f"variant: expected 'A', 'B' or 'C', got {self.variant!r}")
-        for name in ("regions", "width", "branch_width", "steps", "points", "attention_layers"):
-            if not isinstance(getattr(self, name), int):
-                raise ValueError(f"{name}: expected an integer, got {getattr(self, name)!r}")
-        for name in ("regions", "width", "branch_width", "steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if self.points < 3:
-            raise ValueError(f"points: expected at least 3, got {self.points}")
-        if self.attention_layers < 0:
-            raise ValueError(f"attention_layers: expected at least 0, got {self.attention_layers}")
+        if self.decoder not in ("landmarks", "pose"):
+            raise ValueError(f"decoder: expected 'landmarks' or 'pose', got {self.decoder!r}")
+        check_whole(self, regions=1, width=1, branch_width=1, attention_layers=0, landmarks=1, key_width=1)
+        check_whole(self, steps=1, points=3)
         for name in ("encoder_widths", "position_widths", "decoder_widths"):
             widths = getattr(self, name)
             object.__setattr__(self, name, tuple(widths))

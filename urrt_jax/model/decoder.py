@@ -1,37 +1,68 @@
-"""Region-aware decoders: one transform a region, fused by how many points the region holds.
+"""Region-aware decoding: from the regions of both clouds to one transform.
 
-A transform is nine numbers on the way: six for the rotation (two columns, before they are made orthonormal) and three
-for the translation. Rotation matrices do not average to a rotation; these do, and are projected once, after the fusion.
+Decoder g_k reads what region k knows of both clouds and gives its share of the answer; the shares are fused by how many
+points the region holds. What a share is, is the configuration's: landmarks (``landmarks.py``) or a pose (``pose.py``).
 """
 
-import flax.linen as nn
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.rigid import Rigid, rotation_from_6d
-from urrt_jax.model.blocks import Perceptron, run
+from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.model.blocks import run
 from urrt_jax.model.config import ModelConfig
-
-_IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-
-
-def decoders(config: ModelConfig) -> nn.Module:
-    """The functions {g_k}: n perceptrons with weights of their own, (n, 2d) to (n, 9); a single one for model A."""
-    small = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
-    kind = Perceptron
-    if config.has_regions:
-        kind = nn.vmap(Perceptron, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=0, out_axes=0)
-    return kind((*config.decoder_widths, 9), normalize=True, output_init=small)
+from urrt_jax.model.landmarks import align_landmarks, key_network, landmark_decoders, place_landmarks
+from urrt_jax.model.pose import decode_poses, fuse_poses, pose_decoders
 
 
-def decode(config: ModelConfig, params: dict, source: Array, target: Array) -> Array:
-    """Transform codes: (n, 9) from region features (n, d) of both clouds, or (9,) from shape embeddings (d,).
+class Parts(NamedTuple):
+    """What the decoders read of one cloud: its regions, or for model A the whole shape as a single one.
 
-    The decoders give the difference from the identity's code, so an untrained network hardly moves anything.
+    Attributes:
+      features: (n, d), attended.
+      counts: (n,), points in each.
+      cloud: N points.
+      keys: (N, c), by which landmarks find points; None where decoders give poses.
     """
-    pair = jnp.concatenate([source, target], axis=-1)
-    return run(decoders(config), params, pair) + jnp.array((*_IDENTITY_6D, 0.0, 0.0, 0.0), pair.dtype)
+
+    features: Array
+    counts: Array
+    cloud: Cloud
+    keys: Array | None
+
+
+def init_decoder(config: ModelConfig, key: Array) -> dict:
+    """Fresh parameters of the decoders."""
+    pair = jnp.zeros((config.regions if config.has_regions else 1, 2 * config.width))
+    if config.decoder == "pose":
+        return dict(pose_decoders(config).init(key, pair)["params"])
+    keys, queries = jax.random.split(key)
+    embedding = jnp.zeros((1, config.width))
+    return {
+        "keys": key_network(config).init(keys, embedding)["params"],
+        "landmarks": landmark_decoders(config).init(queries, pair)["params"],
+    }
+
+
+def point_keys(config: ModelConfig, params: dict, features: Array) -> Array | None:
+    """The keys (N, c) of points from their embeddings (N, d); None where decoders give poses."""
+    return None if config.decoder == "pose" else run(key_network(config), params["keys"], features)
+
+
+def decode(config: ModelConfig, params: dict, source: Parts, target: Parts) -> Rigid:
+    """φ of eq. (3): the transform from source to target that the decoders see."""
+    weights = fusion_weights(source.counts, target.counts)
+    if source.keys is None or target.keys is None:
+        return fuse_poses(decode_poses(config, params, source.features, target.features), weights)
+    seekers, here, there = params["landmarks"], source.features, target.features
+    return align_landmarks(
+        place_landmarks(config, seekers, here, there, source.keys, source.cloud),
+        place_landmarks(config, seekers, there, here, target.keys, target.cloud),
+        weights,
+    )
 
 
 def fusion_weights(source_counts: Array, target_counts: Array) -> Array:
@@ -43,13 +74,3 @@ def fusion_weights(source_counts: Array, target_counts: Array) -> Array:
     shared = jnp.where((source_counts > 0) & (target_counts > 0), counts, 0.0)
     weights = jnp.where(jnp.sum(shared) > 0, shared, counts)
     return weights / jnp.maximum(jnp.sum(weights), 1.0)
-
-
-def fuse(codes: Array, weights: Array) -> Rigid:
-    """φ of eq. (3): the transform of the weighted mean of codes (n, 9) with weights (n,)."""
-    return to_rigid(jnp.einsum("k,kc->c", weights, codes, precision=jax.lax.Precision.HIGHEST))
-
-
-def to_rigid(code: Array) -> Rigid:
-    """The transform of one code (9,)."""
-    return Rigid(rotation_from_6d(code[:6]), code[6:])

@@ -16,7 +16,7 @@ from urrt_jax.geometry.clouds import Cloud, denormalize_translation, normalize_p
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.attention import RegionTransformer, attend_regions
 from urrt_jax.model.config import ModelConfig
-from urrt_jax.model.decoder import decode, decoders, fuse, fusion_weights, to_rigid
+from urrt_jax.model.decoder import Parts, decode, init_decoder, point_keys
 from urrt_jax.model.encoder import PointEncoder, encode_points
 from urrt_jax.model.partition import RegionBranches, Regions, branch_logits, region_labels, split_regions
 
@@ -36,10 +36,12 @@ class Encoding(NamedTuple):
     Attributes:
       embedding: (d,), the shape embedding e.
       regions: the cloud's regions, with the attended features a; None for model A.
+      parts: what the decoders read of it.
     """
 
     embedding: Array
     regions: Regions | None
+    parts: Parts
 
 
 class Estimate(NamedTuple):
@@ -72,8 +74,7 @@ def init_model(key: Array, config: ModelConfig) -> Model:
         params["partition"] = RegionBranches(config).init(keys[1], points, embedding)["params"]
         # Without attention layers and position encoding this stage learns nothing and has no parameters.
         params["attention"] = RegionTransformer(config).init(keys[2], *sequence).get("params", {})
-    pair = jnp.zeros((n, 2 * d)) if config.has_regions else jnp.zeros(2 * d)
-    params["decoder"] = decoders(config).init(keys[3], pair)["params"]
+    params["decoder"] = init_decoder(config, keys[3])
     return Model(config, params)
 
 
@@ -81,21 +82,13 @@ def encode(model: Model, cloud: Cloud) -> Encoding:
     """The encoding of one normalised cloud."""
     config, params = model.config, model.params
     features, embedding = encode_points(config, params["encoder"], cloud)
+    keys = point_keys(config, params["decoder"], features)
     if not config.has_regions:
-        return Encoding(embedding, None)
+        return Encoding(embedding, None, Parts(embedding[None], jnp.sum(cloud.mask)[None], cloud, keys))
     logits = branch_logits(config, params["partition"], cloud.points, jax.lax.stop_gradient(embedding))
     regions = split_regions(cloud, features, region_labels(logits), config.regions)
     attended = attend_regions(config, params["attention"], regions)
-    return Encoding(embedding, regions._replace(features=attended))
-
-
-def match(model: Model, source: Encoding, target: Encoding) -> Rigid:
-    """The transform from source to target that one application of the decoders sees."""
-    config, params = model.config, model.params
-    if source.regions is None or target.regions is None:
-        return to_rigid(decode(config, params["decoder"], source.embedding, target.embedding))
-    codes = decode(config, params["decoder"], source.regions.features, target.regions.features)
-    return fuse(codes, fusion_weights(source.regions.counts, target.regions.counts))
+    return Encoding(embedding, regions._replace(features=attended), Parts(attended, regions.counts, cloud, keys))
 
 
 def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
@@ -110,7 +103,8 @@ def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
         seen = jax.tree.map(jax.lax.stop_gradient, before)
         moved = jnp.where(source.mask[:, None], rigid.apply(seen, source.points), 0.0)
         encoding = encode(model, source._replace(points=moved))
-        after = rigid.compose(match(model, encoding, target_encoding), seen)
+        found = decode(model.config, model.params["decoder"], encoding.parts, target_encoding.parts)
+        after = rigid.compose(found, seen)
         return after, (after, seen, encoding)
 
     last, (steps, seen, encodings) = jax.lax.scan(step, rigid.identity(), None, length=model.config.steps)

@@ -3,7 +3,8 @@
 ``PEERS`` names them all. A peer is a frozen configuration whose ``align_pair`` gives the (4, 4) matrix of one pair.
 Its library is imported when it is used; the extra ``peers`` installs all but Go-ICP. Lengths are in units of the
 shapes' bounding sphere; ``OnScans`` brings scans of any unit to it. The settings were chosen among a few on training
-shapes: clean, independently sampled with noise, cropped and with outliers (``experiments/peer_settings``).
+shapes: clean, independently sampled with noise, cropped and with outliers (``experiments/peer_settings``); those of ICP
+from many starts were not.
 """
 
 from urrt_jax.peers.correspondences import FGR, RANSAC, KISSMatcher

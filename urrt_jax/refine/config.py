@@ -1,7 +1,8 @@
 """How to refine."""
 
 import dataclasses
-import math
+
+from urrt_jax.checks import check_positive, check_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,14 +41,7 @@ class ICP:
     tolerance: float = 5e-5
 
     def __post_init__(self) -> None:
-        for name, least in (("coarse_points", 0), ("coarse_iterations", 1), ("points", 3), ("iterations", 1)):
-            if type(getattr(self, name)) is not int:
-                raise ValueError(f"{name}: expected a whole number, got {getattr(self, name)!r}")
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
-        for name in ("reach", "inlier_distance", "normal_radius", "tolerance"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 < value < math.inf):
-                raise ValueError(f"{name}: expected a positive number, got {value!r}")
+        check_whole(self, coarse_points=0, coarse_iterations=1, points=3, iterations=1)
+        check_positive(self, "reach", "inlier_distance", "normal_radius", "tolerance")
         if not (isinstance(self.plane, int | float) and 0 <= self.plane <= 1):
             raise ValueError(f"plane: expected a share from 0 to 1, got {self.plane!r}")

@@ -5,9 +5,13 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import jax
+import numpy as np
+
 import urrt_jax
 from urrt_jax.evaluation import find_method, find_protocol
 from urrt_jax.reproduce.tables import heading
+from urrt_jax.weights import model_card
 
 
 class _Table:
@@ -190,3 +194,15 @@ def find_experiment(name: str) -> Experiment:
         known = ", ".join(folder.name for folder in folders)
         raise ValueError(f"table: expected one of {known}, or a folder with a config.toml, got {name!r}")
     return read_experiment(fitting[0])
+
+
+def results_header(experiment: Experiment, data: str, model: str, command: str) -> dict[str, Any]:
+    """What every results file says of itself first: its subject, and what its numbers depend on."""
+    return {
+        "title": experiment.title,
+        "note": experiment.note,
+        "command": command,
+        "versions": {"urrt_jax": urrt_jax.__version__, "jax": jax.__version__, "numpy": np.__version__},
+        "model_sha256": model_card(model)["sha256"],
+        "data": Path(data).name,
+    }

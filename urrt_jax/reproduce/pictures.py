@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-import urrt_jax
 from urrt_jax.atomic import write_atomically
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import Trial, evaluate, find_method, find_protocol, spread
-from urrt_jax.reproduce.experiment import Experiment
+from urrt_jax.reproduce.experiment import Experiment, results_header
 from urrt_jax.reproduce.figures import check_drawing
-from urrt_jax.weights import model_card
 
 _TARGET, _OFF, _ON, _INK = "#aeb7c2", "#c0392b", "#2a67b0", "#2f3640"
 _TOUCHING = 0.04
@@ -74,15 +72,7 @@ def draw_pairs(
     figure.subplots_adjust(left=0.03, right=0.99, top=0.93, bottom=0.01, wspace=0.0, hspace=0.02)
     out.mkdir(parents=True, exist_ok=True)
     figure.savefig(out / "figure.png")
-    results = {
-        "title": experiment.title,
-        "note": experiment.note,
-        "command": command,
-        "versions": {"urrt_jax": urrt_jax.__version__},
-        "model_sha256": model_card(model)["sha256"],
-        "data": Path(data).name,
-        "pairs": rows,
-    }
+    results = results_header(experiment, data, model, command) | {"pairs": rows}
     write_atomically(out / "results.json", json.dumps(results, indent=1) + "\n")
     return results
 

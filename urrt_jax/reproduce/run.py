@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import urrt_jax
 from urrt_jax.atomic import write_atomically
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import (
@@ -26,10 +25,9 @@ from urrt_jax.evaluation import (
     spread,
     values_path,
 )
-from urrt_jax.reproduce.experiment import Experiment, Part, Sweep
+from urrt_jax.reproduce.experiment import Experiment, Part, Sweep, results_header
 from urrt_jax.reproduce.figures import check_drawing, draw_recalls, draw_sweeps, draw_trends
 from urrt_jax.reproduce.tables import as_markdown
-from urrt_jax.weights import model_card
 
 AXISYMMETRIC = ("bottle", "bowl", "cone", "cup", "flower_pot", "lamp", "tent", "vase")
 """Categories of ModelNet40 whose turn about their own axis cannot be seen, for the most part."""
@@ -74,16 +72,10 @@ def reproduce(
     """
     check_drawing()
     runner = _Runner(data, out.parent / "items", model, limit, progress)
-    results: dict[str, Any] = {
-        "title": experiment.title,
-        "note": experiment.note,
-        "command": command,
-        "versions": {"urrt_jax": urrt_jax.__version__, "jax": jax.__version__, "numpy": np.__version__},
+    results: dict[str, Any] = results_header(experiment, data, model, command) | {
         "device": jax.devices()[0].platform,
         "processor": f"{os.cpu_count()} cores, {platform.processor() or platform.machine()}",
         "model": Path(model).stem,
-        "model_sha256": model_card(model)["sha256"],
-        "data": Path(data).name,
         "seed": "the number of each item",
         "columns": list(experiment.columns),
         "published_columns": list(experiment.published_columns),

@@ -1,7 +1,8 @@
 """How to search."""
 
 import dataclasses
-import math
+
+from urrt_jax.checks import check_positive, check_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,17 +36,9 @@ class Search:
     inlier_distance: float = 1.5
 
     def __post_init__(self) -> None:
-        for name in ("points", "matches", "support", "rotations", "kept"):
-            if type(getattr(self, name)) is not int:
-                raise ValueError(f"{name}: expected a whole number, got {getattr(self, name)!r}")
-        for name, least in (("points", 16), ("matches", 0), ("support", 3), ("kept", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
-        if self.rotations not in (0, 1, 24, 60):
-            raise ValueError(f"rotations: expected 0, 1, 24 or 60, got {self.rotations}")
+        check_whole(self, points=16, matches=0, support=3, kept=1)
+        if type(self.rotations) is not int or self.rotations not in (0, 1, 24, 60):
+            raise ValueError(f"rotations: expected 0, 1, 24 or 60, got {self.rotations!r}")
         if not self.matches + self.rotations:
             raise ValueError("matches and rotations: both are 0, which leaves no hypothesis")
-        for name in ("normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 < value < math.inf):
-                raise ValueError(f"{name}: expected a positive number, got {value!r}")
+        check_positive(self, "normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance")

@@ -16,6 +16,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from urrt_jax.atomic import write_atomically
+from urrt_jax.checks import check_whole
 from urrt_jax.data import Shapes
 from urrt_jax.model import Model
 from urrt_jax.training.checkpoints import Checkpoints, ranking_loss
@@ -45,9 +46,7 @@ class LoopConfig:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        for name, least in (("every", 1), ("log_every", 1), ("validation_pairs", 1), ("patience", 0), ("keep", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        check_whole(self, every=1, log_every=1, validation_pairs=1, patience=0, keep=1)
 
 
 def train(

@@ -25,6 +25,7 @@ class PairConfig:
       max_angle: each of the three Euler angles is uniform in [0, max_angle] (DCP's protocol).
       signed: share of pairs whose angles take random signs, so that the whole range around zero is seen.
       translation: each component is uniform in ±translation.
+      both_ways: share of pairs in which the source is the posed cloud; in the others it is the target (DCP's protocol).
       clean_share: first share of the training in which every pair is clean; then corruptions come in ...
       ramp_share: ... over this share, up to
       corrupted: the share of pairs that are corrupted at the end.
@@ -38,6 +39,7 @@ class PairConfig:
     max_angle: float = 45.0
     signed: float = 0.5
     translation: float = 0.5
+    both_ways: float = 0.5
     clean_share: float = 0.3
     ramp_share: float = 0.1
     corrupted: float = 0.75
@@ -47,7 +49,7 @@ class PairConfig:
     outlier_sigma: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("signed", "clean_share", "ramp_share", "corrupted", "keep", "outliers"):
+        for name in ("signed", "both_ways", "clean_share", "ramp_share", "corrupted", "keep", "outliers"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")
         if self.points < 3:
@@ -163,7 +165,7 @@ def make_pair(
     target = jax.tree.map(lambda spoiled, clean: jnp.where(corrupted, spoiled, clean), target, whole)
 
     # Either cloud may be the one in the canonical pose, so that the partition learns from both and poses go both ways.
-    swap = jax.random.bernoulli(jax.random.fold_in(noise_key, 2))
+    swap = jax.random.bernoulli(jax.random.fold_in(noise_key, 2), config.both_ways)
     still = rigid.identity()
     source_pose = jax.tree.map(lambda a, b: jnp.where(swap, a, b), pose, still)
     target_pose = jax.tree.map(lambda a, b: jnp.where(swap, a, b), still, pose)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from urrt_jax.checks import check_positive, check_whole
 from urrt_jax.model import ModelConfig, init_model
 from urrt_jax.training.pairs import PairConfig
 
@@ -50,14 +51,8 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "occupancy_queries", "loss_points", "steps_per_call"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise ValueError(f"seed: expected at least 0, got {self.seed}")
-        for name in ("learning_rate", "clip", "chamfer_scale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        check_whole(self, steps=1, batch=1, occupancy_queries=1, loss_points=1, steps_per_call=1, seed=0)
+        check_positive(self, "learning_rate", "clip", "chamfer_scale")
         for name in ("warmup", "weight_decay", "occupancy_weight"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")

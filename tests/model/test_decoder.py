@@ -1,0 +1,169 @@
+"""Decoding: what one application of the decoders must give, whatever their parameters."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import make_cloud, normalize_pair
+from urrt_jax.model import estimate, init_model
+from urrt_jax.model.decoder import fusion_weights
+from urrt_jax.model.landmarks import Landmarks, align_landmarks, landmark_decoders, place_landmarks
+from urrt_jax.model.pose import fuse_poses
+
+_estimate = jax.jit(estimate)
+
+
+def _close(first, second, atol=1e-5):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), first, second)
+
+
+@pytest.fixture(scope="module", params=["A", "C"])
+def one_step(request, small_config, make_model):
+    """A function of the key: a network of one step with perturbed parameters."""
+    config = dataclasses.replace(small_config, variant=request.param, steps=1)
+    return lambda seed: make_model(config, seed)
+
+
+@pytest.fixture(scope="module")
+def turned(cloud, pose):
+    """Two clouds of 60 points, normalised, the second one turned."""
+    return normalize_pair(make_cloud(cloud[:60]), make_cloud((cloud[60:120] @ pose[0].T).astype(np.float32)))
+
+
+def _shapes() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "blob": rng.normal(size=(60, 3)),
+        "line": np.outer(np.linspace(-1, 1, 40), [1.0, 2, 3]),
+        "one point repeated": np.ones((40, 3)),
+        "two points": np.repeat(np.eye(3)[:2], 20, axis=0),
+        "cube": np.stack(np.meshgrid(*[[-1.0, 0, 1]] * 3), -1).reshape(-1, 3),
+    }
+
+
+@pytest.mark.parametrize("name", _shapes())
+@pytest.mark.parametrize("seed", [0, 1])
+def test_aligned_clouds_stay_where_they_are(one_step, name, seed):
+    """Whatever the parameters: equal clouds have equal landmarks, so the truth is a fixed point."""
+    points = _shapes()[name].astype(np.float32)
+    source, target, _ = normalize_pair(make_cloud(points), make_cloud(points[::-1].copy()))
+    _close(_estimate(one_step(seed), source, target).transform, rigid.identity(), atol=1e-4)
+
+
+def test_swapped_clouds_give_the_inverse(one_step, turned):
+    source, target, _ = turned
+    there, back = (_estimate(one_step(0), *pair).transform for pair in ((source, target), (target, source)))
+    assert float(rigid.rotation_angle(there.rotation, jnp.eye(3))) > 0.01
+    _close(rigid.compose(there, back), rigid.identity(), atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def place(small_config):
+    """A function of (points, mask): landmarks under fixed random features, keys and decoders."""
+    keys = jax.random.split(jax.random.key(0), 4)
+    own, other = (jax.random.normal(key, (4, 16)) for key in keys[:2])
+    params = landmark_decoders(small_config).init(keys[2], jnp.zeros((4, 32)))["params"]
+    point_keys = 3 * jax.random.normal(keys[3], (60, small_config.key_width))
+    return jax.jit(lambda p, m: place_landmarks(small_config, params, own, other, point_keys, make_cloud(p, m)))
+
+
+def test_landmarks_lie_among_the_points_and_apart(place, cloud):
+    mask = np.arange(60) < 40
+    places = np.asarray(place(cloud[:60], mask).places).reshape(-1, 3)
+    assert np.all(places >= cloud[:40].min(0) - 1e-6)
+    assert np.all(places <= cloud[:40].max(0) + 1e-6)
+    assert np.min(places.std(axis=0)) > 0.05
+
+
+def test_landmarks_do_not_see_padding(place, cloud):
+    mask = np.arange(60) < 40
+    other = np.where(mask[:, None], cloud[:60], np.float32(9))
+    np.testing.assert_array_equal(place(other, mask).places, place(cloud[:60], mask).places)
+
+
+def test_landmarks_move_with_points_whose_keys_stay(place, cloud, pose):
+    mask = np.ones(60, bool)
+    moved = place((cloud[:60] @ pose[0].T + pose[1]).astype(np.float32), mask).places
+    np.testing.assert_allclose(moved, place(cloud[:60], mask).places @ pose[0].T + pose[1], atol=1e-5)
+
+
+def test_landmarks_of_no_point_are_finite(place, cloud):
+    assert bool(jnp.all(jnp.isfinite(place(cloud[:60], np.zeros(60, bool)).places)))
+
+
+def _landmarks(seed: int = 0) -> Landmarks:
+    rng = np.random.default_rng(seed)
+    return Landmarks(
+        jnp.asarray(rng.normal(size=(4, 5, 3)), jnp.float32), jnp.asarray(rng.normal(size=(4, 5)), jnp.float32)
+    )
+
+
+def test_matching_landmarks_give_their_motion(pose):
+    source = _landmarks()
+    target = source._replace(places=source.places @ pose[0].T + pose[1])
+    found = align_landmarks(source, target, jnp.full(4, 0.25))
+    _close(found, rigid.Rigid(pose[0], pose[1]), atol=1e-3)
+
+
+def test_landmarks_of_a_region_without_weight_do_not_count(pose):
+    source, weights = _landmarks(), jnp.array([0.5, 0.0, 0.3, 0.2])
+    target = source._replace(places=source.places @ pose[0].T + pose[1])
+    astray = target._replace(places=target.places.at[1].add(7.0))
+    _close(align_landmarks(source, astray, weights), align_landmarks(source, target, weights))
+
+
+def test_distrusted_landmarks_hardly_count(pose):
+    source = _landmarks()
+    target = source._replace(places=source.places @ pose[0].T + pose[1])
+    astray = target._replace(places=target.places.at[1, 2].add(7.0), trust=target.trust.at[1, 2].set(-30.0))
+    _close(align_landmarks(source, astray, jnp.full(4, 0.25)), rigid.Rigid(pose[0], pose[1]), atol=1e-3)
+
+
+def test_landmarks_in_one_place_turn_nothing():
+    """Rounding alone would otherwise choose the rotation."""
+    source = _landmarks()
+    source, target = (source._replace(places=jnp.ones((4, 5, 3)) + 1e-6 * _landmarks(k).places) for k in (1, 2))
+    _close(align_landmarks(source, target, jnp.full(4, 0.25)).rotation, jnp.eye(3), atol=1e-5)
+
+
+def test_untrained_pose_decoders_hardly_move_anything(small_config, turned):
+    model = init_model(jax.random.key(0), dataclasses.replace(small_config, decoder="pose"))
+    source, target, _ = turned
+    assert float(rigid.rotation_angle(_estimate(model, source, target).transform.rotation, jnp.eye(3))) < 0.3
+
+
+def test_fusion_weighs_regions_by_their_points():
+    weights = fusion_weights(jnp.array([10.0, 20, 30]), jnp.array([20.0, 20, 0]))
+    np.testing.assert_allclose(weights, [30 / 70, 40 / 70, 0], atol=1e-6)
+
+
+def test_fusion_without_a_shared_region_falls_back_to_counts():
+    weights = fusion_weights(jnp.array([10.0, 0]), jnp.array([0.0, 30]))
+    np.testing.assert_allclose(weights, [0.25, 0.75], atol=1e-6)
+
+
+def test_fusion_of_nothing_is_finite():
+    np.testing.assert_array_equal(fusion_weights(jnp.zeros(3), jnp.zeros(3)), 0)
+
+
+@given(st.integers(0, 2**31 - 1))
+def test_fused_poses_are_a_rotation(seed):
+    rng = np.random.default_rng(seed)
+    codes = jnp.asarray(rng.normal(size=(4, 9)), jnp.float32)
+    rotation = np.asarray(fuse_poses(codes, jnp.asarray(rng.dirichlet(np.ones(4)), jnp.float32)).rotation)
+    np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-4)
+    assert np.linalg.det(rotation) > 0
+
+
+def test_fusion_of_equal_poses_is_that_pose():
+    turn = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
+    code = np.concatenate([turn[:, 0], turn[:, 1], [1, 2, 3]]).astype(np.float32)
+    fused = fuse_poses(jnp.tile(code, (3, 1)), jnp.array([0.2, 0.5, 0.3]))
+    _close(fused, rigid.Rigid(turn, np.array([1.0, 2, 3])), atol=1e-6)
