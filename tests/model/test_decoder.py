@@ -40,11 +40,11 @@ def turned(cloud, pose):
 def _shapes() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     return {
-        "blob": rng.normal(size=(60, 3)),
+        "blob": rng.normal(size=(40, 3)),
         "line": np.outer(np.linspace(-1, 1, 40), [1.0, 2, 3]),
         "one point repeated": np.ones((40, 3)),
         "two points": np.repeat(np.eye(3)[:2], 20, axis=0),
-        "cube": np.stack(np.meshgrid(*[[-1.0, 0, 1]] * 3), -1).reshape(-1, 3),
+        "box": np.stack(np.meshgrid([-1.0, 1], [-2.0, -1, 1, 2], [-2.0, -1, 0, 1, 2]), -1).reshape(-1, 3),
     }
 
 
@@ -66,12 +66,14 @@ def test_swapped_clouds_give_the_inverse(one_step, turned):
 
 @pytest.fixture(scope="module")
 def place(small_config):
-    """A function of (points, mask): landmarks under fixed random features, keys and decoders."""
+    """A function of (points, mask, shift of all keys): landmarks under fixed random features, keys and decoders."""
     keys = jax.random.split(jax.random.key(0), 4)
     own, other = (jax.random.normal(key, (4, 16)) for key in keys[:2])
     params = landmark_decoders(small_config).init(keys[2], jnp.zeros((4, 32)))["params"]
     point_keys = 3 * jax.random.normal(keys[3], (60, small_config.key_width))
-    return jax.jit(lambda p, m: place_landmarks(small_config, params, own, other, point_keys, make_cloud(p, m)))
+    return jax.jit(
+        lambda p, m, k=0.0: place_landmarks(small_config, params, own, other, point_keys + k, make_cloud(p, m))
+    )
 
 
 def test_landmarks_lie_among_the_points_and_apart(place, cloud):
@@ -92,6 +94,11 @@ def test_landmarks_move_with_points_whose_keys_stay(place, cloud, pose):
     mask = np.ones(60, bool)
     moved = place((cloud[:60] @ pose[0].T + pose[1]).astype(np.float32), mask).places
     np.testing.assert_allclose(moved, place(cloud[:60], mask).places @ pose[0].T + pose[1], atol=1e-5)
+
+
+def test_what_all_keys_share_moves_no_landmark(place, cloud):
+    mask = np.arange(60) < 40
+    np.testing.assert_allclose(place(cloud[:60], mask, 0.7).places, place(cloud[:60], mask).places, atol=1e-4)
 
 
 def test_landmarks_of_no_point_are_finite(place, cloud):

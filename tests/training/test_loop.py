@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.traverse_util import flatten_dict
 
 from urrt_jax import ModelConfig
 from urrt_jax.data import Shapes
@@ -133,7 +134,13 @@ def test_steps_per_call_do_not_change_the_parameters(arrays):
     for _ in range(5):
         alone, _ = train_steps(alone, arrays, _CONFIG)
     assert int(together.step) == int(alone.step) == 5
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), together.params, alone.params)
+    flat = flatten_dict(together.params), flatten_dict(alone.params)
+    for params in flat:
+        # They move all keys alike (the inner one through units that are on for every point), which no landmark sees (a
+        # test says so): what is left of their gradient is rounding, of which Adam makes steps.
+        for layer in ("LayerNorm_0", "Dense_1"):
+            del params["decoder", "keys", layer, "bias"]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *flat)
 
 
 def test_a_step_changes_the_parameters(arrays):
