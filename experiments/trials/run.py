@@ -1,0 +1,130 @@
+"""What is worth changing in the network and its training: one thing at a time, with a short budget each.
+
+    python experiments/trials/run.py --data PATH [--only NAME ...]
+
+Every trial trains the base configuration with one change on clean training pairs, and is measured on pairs of shapes
+held out of the training split; no test shape is looked at. Runs are kept in runs/ beside this file: an interrupted
+command continues where it stopped. Writes results.json and table.md beside this file, with the trials that are there.
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from urrt_jax.data import Shapes, load_shapes
+from urrt_jax.model import ModelConfig
+from urrt_jax.training.loop import LoopConfig, train
+from urrt_jax.training.pairs import PairConfig
+from urrt_jax.training.state import TrainConfig
+from urrt_jax.training.validation import validate, validation_pairs
+
+HERE = Path(__file__).parent
+BASE = TrainConfig(
+    model=ModelConfig(points=512),
+    pairs=PairConfig(points=512, corrupted=0.0),
+    steps=500,
+    learning_rate=1.5e-3,
+    steps_per_call=10,
+)
+TRIALS: dict[str, dict[str, Any]] = {
+    "base: landmarks, n = 8, K = 3": {},
+    "decoders that regress the pose": {"model": {"decoder": "pose"}},
+    "4 landmarks a region": {"model": {"landmarks": 4}},
+    "16 landmarks a region": {"model": {"landmarks": 16}},
+    "model A: no regions, 8 landmarks": {"model": {"variant": "A"}},
+    "model A: no regions, 64 landmarks": {"model": {"variant": "A", "landmarks": 64}},
+    "model B: no position encoding": {"model": {"variant": "B"}},
+    "n = 4": {"model": {"regions": 4}},
+    "n = 12": {"model": {"regions": 12}},
+    "n = 16": {"model": {"regions": 16}},
+    "n = 24": {"model": {"regions": 24}},
+    "no attention": {"model": {"attention_layers": 0}},
+    "two attention layers": {"model": {"attention_layers": 2}},
+    "d = 64": {"model": {"width": 64}},
+    "d = 256": {"model": {"width": 256}},
+    "deeper encoder": {"model": {"encoder_widths": (64, 64, 128, 256)}},
+    "K = 1": {"model": {"steps": 1}},
+    "K = 2": {"model": {"steps": 2}},
+    "K = 5": {"model": {"steps": 5}},
+    "256 points": {"model": {"points": 256}},
+    "occupancy weight 0.005": {"occupancy_weight": 0.005},
+    "occupancy weight 0.1": {"occupancy_weight": 0.1},
+    "Chamfer scale 0.03": {"chamfer_scale": 0.03},
+    "Chamfer scale 0.3": {"chamfer_scale": 0.3},
+    "learning rate 7.5e-4": {"learning_rate": 7.5e-4},
+    "learning rate 3e-3": {"learning_rate": 3e-3},
+    "batches of 16, twice the steps": {"batch": 16, "steps": 1000},
+    "batches of 64, half the steps": {"batch": 64, "steps": 250},
+    "no signed angles": {"pairs": {"signed": 0.0}},
+}
+
+
+def configured(changes: dict[str, Any]) -> TrainConfig:
+    """The base configuration with these changes; those of "model" and "pairs" apply to its parts."""
+    parts = {name: dataclasses.replace(getattr(BASE, name), **changes.get(name, {})) for name in ("model", "pairs")}
+    return dataclasses.replace(BASE, **{**changes, **parts})
+
+
+def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
+    """The row of one trial: trained, if its run is not there yet, and measured as all are."""
+    config = configured(TRIALS[name])
+    folder = HERE / "runs" / "".join(letter if letter.isalnum() else "_" for letter in name)
+    loop = LoopConfig(every=config.steps, validation_pairs=16)
+    model = train(config, shapes, validation, folder, loop=loop)
+    pairs = validation_pairs(BASE, {"points": jax.numpy.asarray(validation.points)}, 512)
+    found = validate(model.params, pairs, dataclasses.replace(BASE, model=config.model))
+    log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    rates = [entry["pairs_per_second"] for entry in log if "pairs_per_second" in entry]
+    return {
+        "trial": name,
+        "changes": TRIALS[name],
+        "chamfer": found["clean_chamfer"],
+        "median": found["clean_rotation_median"],
+        "mean": found["clean_rotation_mean"],
+        "recall_5deg": found["clean_recall_5deg"],
+        "pairs_per_second": float(np.median(rates[1:] or rates)),
+        "parameters": int(sum(leaf.size for leaf in jax.tree.leaves(model.params))),
+    }
+
+
+def as_markdown(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| change | Chamfer | median error | mean error | within 5° | pairs/s in training | parameters |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        lines.append(
+            f"| {row['trial']} | {row['chamfer']:.4f} | {row['median']:.2f}° | {row['mean']:.2f}° "
+            f"| {row['recall_5deg']:.3f} | {row['pairs_per_second']:.0f} | {row['parameters']:,} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
+    parser.add_argument("--only", nargs="+", default=list(TRIALS), help="names of trials", metavar="NAME")
+    flags = parser.parse_args()
+    if unknown := sorted(set(flags.only) - set(TRIALS)):
+        parser.error(f"no trials {unknown}; there are {list(TRIALS)}")
+    shapes, validation = load_shapes(flags.data, points=BASE.pairs.points).split_validation(0.05, BASE.seed)
+    written = HERE / "results.json"
+    rows = {row["trial"]: row for row in (json.loads(written.read_text())["rows"] if written.exists() else [])}
+    for name in flags.only:
+        rows[name] = run_trial(name, shapes, validation)
+        ordered = [rows[each] for each in TRIALS if each in rows]
+        results = {
+            "command": f"python experiments/trials/run.py --data {Path(flags.data).name}",
+            "jax": jax.__version__,
+            "steps": BASE.steps,
+            "batch": BASE.batch,
+            "rows": ordered,
+        }
+        written.write_text(json.dumps(results, indent=1) + "\n")
+        (HERE / "table.md").write_text(as_markdown(ordered))
+    print(as_markdown(list(rows.values())))
