@@ -28,6 +28,12 @@ class Perceptron(nn.Module):
         return nn.Dense(self.widths[-1], kernel_init=self.output_init)(inputs)
 
 
+def region_perceptrons(widths: tuple[int, ...], output_init: nn.initializers.Initializer) -> nn.Module:
+    """Normalised perceptrons with weights of their own, one a region: (n, any) to (n, widths[-1])."""
+    kind = nn.vmap(Perceptron, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=0, out_axes=0)
+    return kind(widths, normalize=True, output_init=output_init)
+
+
 def run(block: nn.Module, params: dict, *inputs: Any) -> Array:
     """The output of a block with these parameters."""
     return cast(Array, block.apply({"params": params}, *inputs))

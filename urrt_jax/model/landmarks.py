@@ -15,7 +15,7 @@ from jax import Array
 
 from urrt_jax.geometry.clouds import Cloud
 from urrt_jax.geometry.rigid import Rigid, procrustes
-from urrt_jax.model.blocks import Perceptron, run
+from urrt_jax.model.blocks import Perceptron, region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
 
 _STIFFNESS = 1e-3  # in a frame of unit radius: far below the spread of landmarks that mean anything
@@ -41,8 +41,7 @@ def key_network(config: ModelConfig) -> nn.Module:
 def landmark_decoders(config: ModelConfig) -> nn.Module:
     """The functions {g_k}: perceptrons with weights of their own, (n, 2d) to (n, C·(c + 1))."""
     large = nn.initializers.he_normal()  # from nearly equal queries all landmarks would be the centroid
-    kind = nn.vmap(Perceptron, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=0, out_axes=0)
-    return kind((*config.decoder_widths, config.landmarks * (config.key_width + 1)), normalize=True, output_init=large)
+    return region_perceptrons((*config.decoder_widths, config.landmarks * (config.key_width + 1)), large)
 
 
 def place_landmarks(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.geometry.rigid import Rigid, rotation_from_6d
-from urrt_jax.model.blocks import Perceptron, run
+from urrt_jax.model.blocks import region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
 
 _IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -19,8 +19,7 @@ _IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 def pose_decoders(config: ModelConfig) -> nn.Module:
     """The functions {g_k}: n perceptrons with weights of their own, (n, 2d) to (n, 9)."""
     small = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
-    kind = nn.vmap(Perceptron, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=0, out_axes=0)
-    return kind((*config.decoder_widths, 9), normalize=True, output_init=small)
+    return region_perceptrons((*config.decoder_widths, 9), small)
 
 
 def decode_poses(config: ModelConfig, params: dict, source: Array, target: Array) -> Array:
