@@ -70,6 +70,11 @@ def small_config() -> ModelConfig:
         branch_width=8,
         position_widths=(8,),
         decoder_widths=(16,),
+        landmarks=5,
+        sharpness=4.0,
+        octaves=4,
+        lookups=16,
+        consensus=3,
         steps=2,
         points=64,
     )

@@ -21,7 +21,7 @@ from urrt_jax import load_model, model_card
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import find_protocol
 from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair, normalize_translation
+from urrt_jax.geometry.clouds import make_cloud, normalize_pair, normalize_translation, subsample
 from urrt_jax.geometry.neighbors import nearest
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model import Model
@@ -60,7 +60,7 @@ def cut(model: Model, sources: Array, targets: Array, rotations: Array, translat
         truth = Rigid(rotation, normalize_translation(rotation, translation, frame))
         answer = estimate_subsampled(model, source, target)
         return Cut(
-            source=point_regions(model, source.points, encode(model, source)),
+            source=point_regions(model, source.points, encode(model, subsample(source, model.config.points))),
             aligned=point_regions(model, rigid.apply(answer.seen, source.points), answer.source),
             target=point_regions(model, target.points, answer.target),
             counterpart=nearest(rigid.apply(truth, source.points), target).index,

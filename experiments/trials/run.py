@@ -2,8 +2,9 @@
 
     python experiments/trials/run.py --data PATH [--only NAME ...]
 
-Every trial trains the base configuration with one change on clean training pairs, and is measured on pairs of shapes
-held out of the training split; no test shape is looked at. Runs are kept in runs/ beside this file: an interrupted
+Every trial trains one configuration with one change, for 600 steps of the usual mixture, and is measured on the
+protocols of the tables, network alone, with every second shape held out of the training split; no test shape is looked
+at. A trial takes some five minutes of two cores. Runs are kept in runs/ beside this file: an interrupted
 command continues where it stopped. Writes results.json and table.md beside this file, with the trials that are there.
 """
 
@@ -17,27 +18,50 @@ import jax
 import numpy as np
 
 from urrt_jax.data import Shapes, load_shapes
+from urrt_jax.evaluation import evaluate
+from urrt_jax.evaluation.methods import Ours
 from urrt_jax.model import ModelConfig
 from urrt_jax.training.loop import LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig
-from urrt_jax.training.validation import validate, validation_pairs
 
 HERE = Path(__file__).parent
+PROTOCOLS = {
+    "dcp": "clean",
+    "incomplete": "D.I.",
+    "incomplete_both": "D.I., both",
+    "drift": "P.D.",
+    "outliers": "D.O.",
+    "independent_noise": "independent + noise",
+}
 BASE = TrainConfig(
-    model=ModelConfig(points=512),
-    pairs=PairConfig(points=512, corrupted=0.0),
-    steps=500,
+    model=ModelConfig(sharpness=4.0, octaves=4, lookups=256, consensus=8),
+    pairs=PairConfig(clean_share=0.0, ramp_share=0.2),
+    steps=600,
     learning_rate=1.5e-3,
+    unrolled=2,
     steps_per_call=10,
 )
 TRIALS: dict[str, dict[str, Any]] = {
-    "base: landmarks, n = 8, K = 3": {},
+    "base: surroundings, look-ups, consensus": {},
+    "landmarks of regions alone": {"model": {"sharpness": 1.0, "octaves": 0, "lookups": 0, "consensus": 0}},
+    "no surroundings": {"model": {"octaves": 0}},
+    "surroundings of 3 widths": {"model": {"octaves": 3}},
+    "surroundings of 5 widths": {"model": {"octaves": 5}},
+    "no look-ups": {"model": {"lookups": 0}},
+    "64 look-ups": {"model": {"lookups": 64}},
+    "128 look-ups": {"model": {"lookups": 128}},
+    "512 look-ups": {"model": {"lookups": 512}},
+    "sharpness 1": {"model": {"sharpness": 1.0}},
+    "no consensus": {"model": {"consensus": 0}},
+    "3 rounds of consensus in use": {"model": {"consensus": 3}},
+    "16 rounds of consensus in use": {"model": {"consensus": 16}},
+    "no rounds of consensus in training": {"rounds": 0},
+    "8 rounds of consensus in training": {"rounds": 8},
     "decoders that regress the pose": {"model": {"decoder": "pose"}},
     "4 landmarks a region": {"model": {"landmarks": 4}},
     "16 landmarks a region": {"model": {"landmarks": 16}},
-    "model A: no regions, 8 landmarks": {"model": {"variant": "A"}},
-    "model A: no regions, 64 landmarks": {"model": {"variant": "A", "landmarks": 64}},
+    "model A: no regions": {"model": {"variant": "A"}},
     "model B: no position encoding": {"model": {"variant": "B"}},
     "n = 4": {"model": {"regions": 4}},
     "n = 12": {"model": {"regions": 12}},
@@ -49,8 +73,8 @@ TRIALS: dict[str, dict[str, Any]] = {
     "d = 256": {"model": {"width": 256}},
     "deeper encoder": {"model": {"encoder_widths": (64, 64, 128, 256)}},
     "K = 1": {"model": {"steps": 1}},
-    "K = 2": {"model": {"steps": 2}},
-    "K = 5": {"model": {"steps": 5}},
+    "K = 3, one trained": {"unrolled": 1},
+    "K = 3, all trained": {"unrolled": 3},
     "256 points": {"model": {"points": 256}},
     "occupancy weight 0.005": {"occupancy_weight": 0.005},
     "occupancy weight 0.1": {"occupancy_weight": 0.1},
@@ -58,8 +82,9 @@ TRIALS: dict[str, dict[str, Any]] = {
     "Chamfer scale 0.3": {"chamfer_scale": 0.3},
     "learning rate 7.5e-4": {"learning_rate": 7.5e-4},
     "learning rate 3e-3": {"learning_rate": 3e-3},
-    "batches of 16, twice the steps": {"batch": 16, "steps": 1000},
-    "batches of 64, half the steps": {"batch": 64, "steps": 250},
+    "batches of 16, twice the steps": {"batch": 16, "steps": 1200},
+    "batches of 64, half the steps": {"batch": 64, "steps": 300},
+    "first third clean": {"pairs": {"clean_share": 0.33}},
     "no signed angles": {"pairs": {"signed": 0.0}},
 }
 
@@ -74,34 +99,28 @@ def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
     """The row of one trial: trained, if its run is not there yet, and measured as all are."""
     config = configured(TRIALS[name])
     folder = HERE / "runs" / "".join(letter if letter.isalnum() else "_" for letter in name)
-    loop = LoopConfig(every=config.steps, validation_pairs=16)
-    model = train(config, shapes, validation, folder, loop=loop)
-    pairs = validation_pairs(BASE, {"points": jax.numpy.asarray(validation.points)}, 512)
-    found = validate(model.params, pairs, dataclasses.replace(BASE, model=config.model))
+    model = train(config, shapes, validation, folder, loop=LoopConfig(every=config.steps, validation_pairs=16))
     log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     rates = [entry["pairs_per_second"] for entry in log if "pairs_per_second" in entry]
+    method = Ours(model=model, refine=None)
     return {
         "trial": name,
         "changes": TRIALS[name],
-        "chamfer": found["clean_chamfer"],
-        "median": found["clean_rotation_median"],
-        "mean": found["clean_rotation_mean"],
-        "recall_5deg": found["clean_recall_5deg"],
+        "errors": {
+            protocol: evaluate(method, protocol, validation.points[::2], progress=False).summary()["mae_rotation"]
+            for protocol in PROTOCOLS
+        },
         "pairs_per_second": float(np.median(rates[1:] or rates)),
         "parameters": int(sum(leaf.size for leaf in jax.tree.leaves(model.params))),
     }
 
 
 def as_markdown(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        "| change | Chamfer | median error | mean error | within 5° | pairs/s in training | parameters |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
+    heads = "".join(f" {title} |" for title in PROTOCOLS.values())
+    lines = [f"| MAE(R) |{heads} pairs/s in training | parameters |", "|---|" + "---:|" * (len(PROTOCOLS) + 2)]
     for row in rows:
-        lines.append(
-            f"| {row['trial']} | {row['chamfer']:.4f} | {row['median']:.2f}° | {row['mean']:.2f}° "
-            f"| {row['recall_5deg']:.3f} | {row['pairs_per_second']:.0f} | {row['parameters']:,} |"
-        )
+        errors = "".join(f" {row['errors'][protocol]:.2f}° |" for protocol in PROTOCOLS)
+        lines.append(f"| {row['trial']} |{errors} {row['pairs_per_second']:.0f} | {row['parameters']:,} |")
     return "\n".join(lines) + "\n"
 
 
@@ -114,7 +133,9 @@ if __name__ == "__main__":
         parser.error(f"no trials {unknown}; there are {list(TRIALS)}")
     shapes, validation = load_shapes(flags.data, points=BASE.pairs.points).split_validation(0.05, BASE.seed)
     written = HERE / "results.json"
-    rows = {row["trial"]: row for row in (json.loads(written.read_text())["rows"] if written.exists() else [])}
+    before = json.loads(written.read_text())["rows"] if written.exists() else []
+    rows = {row["trial"]: row for row in before if row["changes"] == TRIALS.get(row["trial"])}
+    ordered: list[dict[str, Any]] = []
     for name in flags.only:
         rows[name] = run_trial(name, shapes, validation)
         ordered = [rows[each] for each in TRIALS if each in rows]
@@ -127,4 +148,4 @@ if __name__ == "__main__":
         }
         written.write_text(json.dumps(results, indent=1) + "\n")
         (HERE / "table.md").write_text(as_markdown(ordered))
-    print(as_markdown(list(rows.values())))
+    print(as_markdown(ordered))

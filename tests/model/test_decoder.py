@@ -14,7 +14,14 @@ from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import make_cloud, normalize_pair
 from urrt_jax.model import estimate, init_model
 from urrt_jax.model.decoder import fusion_weights
-from urrt_jax.model.landmarks import Landmarks, align_landmarks, landmark_decoders, place_landmarks
+from urrt_jax.model.landmarks import (
+    align_landmarks,
+    landmark_decoders,
+    place_landmarks,
+    point_queries,
+    point_trust,
+    region_queries,
+)
 from urrt_jax.model.pose import fuse_poses
 
 _estimate = jax.jit(estimate)
@@ -33,8 +40,8 @@ def one_step(request, small_config, make_model):
 
 @pytest.fixture(scope="module")
 def turned(cloud, pose):
-    """Two clouds of 60 points, normalised, the second one turned."""
-    return normalize_pair(make_cloud(cloud[:60]), make_cloud((cloud[60:120] @ pose[0].T).astype(np.float32)))
+    """Two clouds of 60 points, the second one turned."""
+    return cloud[:60].astype(np.float64), cloud[60:120] @ pose[0].T
 
 
 def _shapes() -> dict[str, np.ndarray]:
@@ -57,28 +64,24 @@ def test_aligned_clouds_stay_where_they_are(one_step, name, seed):
     _close(_estimate(one_step(seed), source, target).transform, rigid.identity(), atol=1e-4)
 
 
-def test_swapped_clouds_give_the_inverse(one_step, turned):
-    source, target, _ = turned
+def test_swapped_clouds_give_the_inverse(one_step, turned, x64):
+    source, target, _ = normalize_pair(*map(make_cloud, turned))
     there, back = (_estimate(one_step(0), *pair).transform for pair in ((source, target), (target, source)))
     assert float(rigid.rotation_angle(there.rotation, jnp.eye(3))) > 0.01
-    _close(rigid.compose(there, back), rigid.identity(), atol=1e-4)
+    _close(rigid.compose(there, back), rigid.identity(), atol=1e-9)
 
 
 @pytest.fixture(scope="module")
-def place(small_config):
-    """A function of (points, mask, shift of all keys): landmarks under fixed random features, keys and decoders."""
-    keys = jax.random.split(jax.random.key(0), 4)
-    own, other = (jax.random.normal(key, (4, 16)) for key in keys[:2])
-    params = landmark_decoders(small_config).init(keys[2], jnp.zeros((4, 32)))["params"]
-    point_keys = 3 * jax.random.normal(keys[3], (60, small_config.key_width))
-    return jax.jit(
-        lambda p, m, k=0.0: place_landmarks(small_config, params, own, other, point_keys + k, make_cloud(p, m))
-    )
+def place():
+    """A function of (points, mask, shift of all keys): landmarks under fixed random queries and keys."""
+    queries, keys = jax.random.split(jax.random.key(0))
+    queries, keys = jax.random.normal(queries, (20, 8)), 3 * jax.random.normal(keys, (60, 8))
+    return jax.jit(lambda p, m, k=0.0: place_landmarks(queries, keys + k, make_cloud(p, m)))
 
 
 def test_landmarks_lie_among_the_points_and_apart(place, cloud):
     mask = np.arange(60) < 40
-    places = np.asarray(place(cloud[:60], mask).places).reshape(-1, 3)
+    places = np.asarray(place(cloud[:60], mask))
     assert np.all(places >= cloud[:40].min(0) - 1e-6)
     assert np.all(places <= cloud[:40].max(0) + 1e-6)
     assert np.min(places.std(axis=0)) > 0.05
@@ -87,62 +90,110 @@ def test_landmarks_lie_among_the_points_and_apart(place, cloud):
 def test_landmarks_do_not_see_padding(place, cloud):
     mask = np.arange(60) < 40
     other = np.where(mask[:, None], cloud[:60], np.float32(9))
-    np.testing.assert_array_equal(place(other, mask).places, place(cloud[:60], mask).places)
+    np.testing.assert_array_equal(place(other, mask), place(cloud[:60], mask))
 
 
 def test_landmarks_move_with_points_whose_keys_stay(place, cloud, pose):
     mask = np.ones(60, bool)
-    moved = place((cloud[:60] @ pose[0].T + pose[1]).astype(np.float32), mask).places
-    np.testing.assert_allclose(moved, place(cloud[:60], mask).places @ pose[0].T + pose[1], atol=1e-5)
+    moved = place((cloud[:60] @ pose[0].T + pose[1]).astype(np.float32), mask)
+    np.testing.assert_allclose(moved, place(cloud[:60], mask) @ pose[0].T + pose[1], atol=1e-5)
 
 
 def test_what_all_keys_share_moves_no_landmark(place, cloud):
     mask = np.arange(60) < 40
-    np.testing.assert_allclose(place(cloud[:60], mask, 0.7).places, place(cloud[:60], mask).places, atol=1e-4)
+    np.testing.assert_allclose(place(cloud[:60], mask, 0.7), place(cloud[:60], mask), atol=1e-4)
 
 
 def test_landmarks_of_no_point_are_finite(place, cloud):
-    assert bool(jnp.all(jnp.isfinite(place(cloud[:60], np.zeros(60, bool)).places)))
+    assert bool(jnp.all(jnp.isfinite(place(cloud[:60], np.zeros(60, bool)))))
 
 
-def _landmarks(seed: int = 0) -> Landmarks:
-    rng = np.random.default_rng(seed)
-    return Landmarks(
-        jnp.asarray(rng.normal(size=(4, 5, 3)), jnp.float32), jnp.asarray(rng.normal(size=(4, 5)), jnp.float32)
+def test_both_clouds_are_asked_for_the_same_surroundings(small_config):
+    """Only where a landmark lies may be asked differently: surroundings look the same from any pose."""
+    own, other, key = jax.random.split(jax.random.key(0), 3)
+    params = landmark_decoders(small_config).init(key, jnp.zeros((4, 32)))["params"]
+    features = jax.random.normal(own, (4, 16)), jax.random.normal(other, (4, 16))
+    queries = region_queries(small_config, params, *features, jnp.full(4, 0.25))
+    width = small_config.key_width
+    assert queries.source.shape == (4 * small_config.landmarks, 2 * width)
+    np.testing.assert_array_equal(queries.source[:, width:], queries.target[:, width:])
+    assert float(jnp.max(jnp.abs(queries.source[:, :width] - queries.target[:, :width]))) > 0.1
+
+
+def test_padding_is_not_looked_up(small_config):
+    keys = jax.random.normal(jax.random.key(0), (6, 2 * small_config.key_width))
+    params = point_trust().init(jax.random.key(1), keys)["params"]
+    queries = point_queries(small_config, params, keys, jnp.array([1, 0, 1, 1, 1, 0], bool))
+    np.testing.assert_array_equal(queries.source, keys)
+    np.testing.assert_array_equal(queries.target, keys)
+    np.testing.assert_array_equal(queries.weights > 0, [1, 0, 1, 1, 1, 0])
+
+
+def test_landmarks_of_equal_surroundings_are_matched_from_any_pose(small_config, make_model):
+    """With queries from surroundings alone one step is exact, whatever the parameters."""
+    model = make_model(dataclasses.replace(small_config, steps=1, points=200), 0)
+    decoder = model.params["decoder"]
+    for part, layer, factor in (("keys", "Dense_1", 0.0), ("surroundings", "Dense_2", 30.0)):
+        decoder[part][layer] = jax.tree.map(lambda leaf, by=factor: by * leaf, decoder[part][layer])
+    points = np.random.default_rng(0).normal(size=(200, 3)) * [1.0, 0.7, 0.4]
+    turn = Rotation.from_rotvec([0.5, -0.9, 0.4]).as_matrix()
+    source, target, _ = normalize_pair(
+        make_cloud(points.astype(np.float32)), make_cloud((points @ turn.T)[::-1].astype(np.float32))
     )
+    found = _estimate(model, source, target).transform
+    assert float(jnp.rad2deg(rigid.rotation_angle(found.rotation, jnp.asarray(turn, jnp.float32)))) < 2
 
 
-def test_matching_landmarks_give_their_motion(pose):
+def _landmarks(seed: int = 0) -> jnp.ndarray:
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(20, 3)), jnp.float32)
+
+
+def _weights() -> jnp.ndarray:
+    return jnp.asarray(np.random.default_rng(9).uniform(0.2, 1, 20), jnp.float32)
+
+
+@pytest.mark.parametrize("rounds", [0, 3])
+def test_matching_landmarks_give_their_motion(pose, rounds):
     source = _landmarks()
-    target = source._replace(places=source.places @ pose[0].T + pose[1])
-    found = align_landmarks(source, target, jnp.full(4, 0.25))
+    found = align_landmarks(source, source @ pose[0].T + pose[1], _weights(), rounds=rounds)
     _close(found, rigid.Rigid(pose[0], pose[1]), atol=1e-3)
 
 
-def test_landmarks_of_a_region_without_weight_do_not_count(pose):
-    source, weights = _landmarks(), jnp.array([0.5, 0.0, 0.3, 0.2])
-    target = source._replace(places=source.places @ pose[0].T + pose[1])
-    astray = target._replace(places=target.places.at[1].add(7.0))
-    _close(align_landmarks(source, astray, weights), align_landmarks(source, target, weights))
+@pytest.mark.parametrize("rounds", [0, 3])
+def test_landmarks_without_weight_do_not_count(pose, rounds):
+    source, weights = _landmarks(), _weights().at[3].set(0.0)
+    target = source @ pose[0].T + pose[1]
+    found = align_landmarks(source, target.at[3].add(7.0), weights, rounds=rounds)
+    _close(found, align_landmarks(source, target, weights, rounds=rounds))
 
 
-def test_distrusted_landmarks_hardly_count(pose):
+def test_landmarks_that_disagree_lose_their_weight(pose):
     source = _landmarks()
-    target = source._replace(places=source.places @ pose[0].T + pose[1])
-    astray = target._replace(places=target.places.at[1, 2].add(7.0), trust=target.trust.at[1, 2].set(-30.0))
-    _close(align_landmarks(source, astray, jnp.full(4, 0.25)), rigid.Rigid(pose[0], pose[1]), atol=1e-3)
+    target = (source @ pose[0].T + pose[1]).at[:6].set(_landmarks(5)[:6])
+    truth = jnp.asarray(pose[0], jnp.float32)
+    errors = [
+        float(rigid.rotation_angle(align_landmarks(source, target, _weights(), rounds=k).rotation, truth))
+        for k in (0, 3, 8)
+    ]
+    assert errors[0] > 0.1
+    assert errors[1] < 0.3 * errors[0]
+    assert errors[2] < 2e-3
 
 
 def test_landmarks_in_one_place_turn_nothing():
     """Rounding alone would otherwise choose the rotation."""
-    source = _landmarks()
-    source, target = (source._replace(places=jnp.ones((4, 5, 3)) + 1e-6 * _landmarks(k).places) for k in (1, 2))
-    _close(align_landmarks(source, target, jnp.full(4, 0.25)).rotation, jnp.eye(3), atol=1e-5)
+    source, target = (jnp.ones((20, 3)) + 1e-6 * _landmarks(k) for k in (1, 2))
+    _close(align_landmarks(source, target, _weights(), rounds=3).rotation, jnp.eye(3), atol=1e-5)
+
+
+def test_landmarks_that_weigh_nothing_move_nothing():
+    found = align_landmarks(_landmarks(1), _landmarks(2), jnp.zeros(20), rounds=3)
+    _close(found, rigid.identity())
 
 
 def test_untrained_pose_decoders_hardly_move_anything(small_config, turned):
     model = init_model(jax.random.key(0), dataclasses.replace(small_config, decoder="pose"))
-    source, target, _ = turned
+    source, target, _ = normalize_pair(*map(make_cloud, turned))
     assert float(rigid.rotation_angle(_estimate(model, source, target).transform.rotation, jnp.eye(3))) < 0.3
 
 

@@ -29,7 +29,11 @@ class NetworkFlags:
         width: Dimension of the embeddings.
         attention_layers: Self-attention layers over the regions.
         decoder: What a region's decoder gives: landmarks to align, or the pose itself.
-        landmarks: Landmarks of a region.
+        landmarks: Landmarks that a region asks for.
+        sharpness: How sharply fresh landmarks choose among points.
+        octaves: Widths at which the surroundings of points are described; 0: not at all.
+        lookups: Points of each cloud that are looked up in both; 0: none.
+        consensus: Rounds in which landmarks that disagree with the others lose weight.
         steps: How often the network is applied, each time to the source as moved so far.
         points: Points of a cloud that the network looks at.
     """
@@ -40,6 +44,10 @@ class NetworkFlags:
     attention_layers: int = 1
     decoder: Literal["landmarks", "pose"] = "landmarks"
     landmarks: int = 8
+    sharpness: float = 1.0
+    octaves: int = 0
+    lookups: int = 0
+    consensus: int = 0
     steps: int = 3
     points: int = 512
 
@@ -96,6 +104,8 @@ class Train:
         warmup: Steps in which the learning rate rises.
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
+        unrolled: Of the network's steps, so many are trained; the later ones see what the last of these saw.
+        rounds: Of consensus among landmarks in training, at most the model's; many keep fresh landmarks from learning.
         steps_per_call: Steps in one dispatch; more of them help on an accelerator.
         seed: Of the first weights and of every pair.
         every: Steps between validations, each followed by a checkpoint.
@@ -117,6 +127,8 @@ class Train:
     warmup: int = 200
     occupancy_weight: float = 0.02
     loss_points: int = 512
+    unrolled: int = 3
+    rounds: int = 3
     steps_per_call: int = 1
     seed: int = 0
     every: int = 500

@@ -1,6 +1,6 @@
 """The 3D-URRT network (Hao and Fang): encoder, region partition, region attention, region decoders, fusion.
 
-One module a stage, in that order; ``network.py`` composes them.
+One module a stage, in that order; ``encoding.py`` composes the stages that see one cloud, ``network.py`` them all.
 """
 
 from urrt_jax.model.config import ModelConfig

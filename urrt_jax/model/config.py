@@ -4,7 +4,7 @@ import dataclasses
 import json
 from typing import Literal
 
-from urrt_jax.checks import check_whole
+from urrt_jax.checks import check_positive, check_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,11 @@ class ModelConfig:
         which are then aligned. "pose": the transform itself, regressed.
       decoder_widths: hidden widths of every decoder g_k.
       landmarks: landmarks of a region.
-      key_width: dimension in which landmarks and points are compared.
+      key_width: dimension in which landmarks and points are compared by place, and again by surroundings.
+      sharpness: factor of the logits of landmarks; fresh networks with more of it choose fewer points.
+      octaves: widths at which the points' surroundings are described (``features/moments.py``); 0: not at all.
+      lookups: points of each cloud that are looked up in both, for landmarks too.
+      consensus: rounds in which landmarks that disagree with the others are weighed down.
       steps: K, how often the network is applied, each time to the source moved by the estimate so far.
       points: points of a cloud that the network looks at; larger clouds are subsampled (``subsample``).
     """
@@ -40,6 +44,10 @@ class ModelConfig:
     decoder_widths: tuple[int, ...] = (128,)
     landmarks: int = 8
     key_width: int = 32
+    sharpness: float = 1.0
+    octaves: int = 0
+    lookups: int = 0
+    consensus: int = 0
     steps: int = 3
     points: int = 512
 
@@ -49,7 +57,8 @@ class ModelConfig:
         if self.decoder not in ("landmarks", "pose"):
             raise ValueError(f"decoder: expected 'landmarks' or 'pose', got {self.decoder!r}")
         check_whole(self, regions=1, width=1, branch_width=1, attention_layers=0, landmarks=1, key_width=1)
-        check_whole(self, steps=1, points=3)
+        check_positive(self, "sharpness")
+        check_whole(self, octaves=0, lookups=0, consensus=0, steps=1, points=3)
         for name in ("encoder_widths", "position_widths", "decoder_widths"):
             widths = getattr(self, name)
             object.__setattr__(self, name, tuple(widths))

@@ -1,37 +1,30 @@
-"""Region-aware decoding: from the regions of both clouds to one transform.
+"""Region-aware decoding: from the encodings of both clouds to one transform.
 
 Decoder g_k reads what region k knows of both clouds and gives its share of the answer; the shares are fused by how many
 points the region holds. What a share is, is the configuration's: landmarks (``landmarks.py``) or a pose (``pose.py``).
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.features.moments import invariant_count
 from urrt_jax.geometry.rigid import Rigid
-from urrt_jax.model.blocks import run
 from urrt_jax.model.config import ModelConfig
-from urrt_jax.model.landmarks import align_landmarks, key_network, landmark_decoders, place_landmarks
+from urrt_jax.model.encoding import Encoding
+from urrt_jax.model.landmarks import (
+    Queries,
+    align_landmarks,
+    key_size,
+    landmark_decoders,
+    place_keys,
+    place_landmarks,
+    point_queries,
+    point_trust,
+    region_queries,
+    surroundings_keys,
+)
 from urrt_jax.model.pose import decode_poses, fuse_poses, pose_decoders
-
-
-class Parts(NamedTuple):
-    """What the decoders read of one cloud: its regions, or for model A the whole shape as a single one.
-
-    Attributes:
-      features: (n, d), attended.
-      counts: (n,), points in each.
-      cloud: N points.
-      keys: (N, c), by which landmarks find points; None where decoders give poses.
-    """
-
-    features: Array
-    counts: Array
-    cloud: Cloud
-    keys: Array | None
 
 
 def init_decoder(config: ModelConfig, key: Array) -> dict:
@@ -39,30 +32,41 @@ def init_decoder(config: ModelConfig, key: Array) -> dict:
     pair = jnp.zeros((config.regions if config.has_regions else 1, 2 * config.width))
     if config.decoder == "pose":
         return dict(pose_decoders(config).init(key, pair)["params"])
-    keys, queries = jax.random.split(key)
-    embedding = jnp.zeros((1, config.width))
-    return {
-        "keys": key_network(config).init(keys, embedding)["params"],
-        "landmarks": landmark_decoders(config).init(queries, pair)["params"],
+    keys = jax.random.split(key, 4)
+    params = {
+        "keys": place_keys(config).init(keys[0], jnp.zeros((1, config.width)))["params"],
+        "landmarks": landmark_decoders(config).init(keys[1], pair)["params"],
     }
+    if config.octaves:
+        invariants = jnp.zeros((1, invariant_count(config.octaves)))
+        params["surroundings"] = surroundings_keys(config).init(keys[2], invariants)["params"]
+    if config.lookups:
+        params["trust"] = point_trust().init(keys[3], jnp.zeros((1, key_size(config))))["params"]
+    return params
 
 
-def point_keys(config: ModelConfig, params: dict, features: Array) -> Array | None:
-    """The keys (N, c) of points from their embeddings (N, d); None where decoders give poses."""
-    return None if config.decoder == "pose" else run(key_network(config), params["keys"], features)
-
-
-def decode(config: ModelConfig, params: dict, source: Parts, target: Parts) -> Rigid:
+def decode(config: ModelConfig, params: dict, source: Encoding, target: Encoding) -> Rigid:
     """φ of eq. (3): the transform from source to target that the decoders see."""
-    weights = fusion_weights(source.counts, target.counts)
-    if source.keys is None or target.keys is None:
-        return fuse_poses(decode_poses(config, params, source.features, target.features), weights)
-    seekers, here, there = params["landmarks"], source.features, target.features
-    return align_landmarks(
-        place_landmarks(config, seekers, here, there, source.keys, source.cloud),
-        place_landmarks(config, seekers, there, here, target.keys, target.cloud),
-        weights,
-    )
+    weights = fusion_weights(source.regions.counts, target.regions.counts)
+    features = source.regions.features, target.regions.features
+    if config.decoder == "pose":
+        return fuse_poses(decode_poses(config, params, *features), weights)
+    queries = region_queries(config, params["landmarks"], *features, weights)
+    if config.lookups:
+        some = [_some_points(encoding, config.lookups) for encoding in (source, target)]
+        asked = point_queries(config, params["trust"], *map(jnp.concatenate, zip(*some, strict=True)))
+        queries = Queries(*(jnp.concatenate(both) for both in zip(queries, asked, strict=True)))
+    places = place_landmarks(config.sharpness * queries.source, source.keys, source.cloud)
+    others = place_landmarks(config.sharpness * queries.target, target.keys, target.cloud)
+    return align_landmarks(places, others, queries.weights, rounds=config.consensus)
+
+
+def _some_points(encoding: Encoding, count: int) -> tuple[Array, Array]:
+    """The keys and the mask of ``count`` points, evenly spread: outliers are first among farthest ones."""
+    keys, mask = encoding.keys, encoding.cloud.mask
+    rows, real = jnp.arange(min(count, mask.shape[0])), jnp.sum(mask)
+    rows = jnp.where(real > rows.shape[0], rows * real // rows.shape[0], rows)
+    return keys[rows], mask[rows]
 
 
 def fusion_weights(source_counts: Array, target_counts: Array) -> Array:

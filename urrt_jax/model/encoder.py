@@ -16,7 +16,7 @@ class PointEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, points: Array) -> Array:
-        """Point embeddings (N, d) of points (N, 3), each from its own coordinates."""
+        """Point embeddings (N, d) of (N, 3 + q): points, each with its coordinates and its q invariants."""
         return Perceptron((*self.config.encoder_widths, self.config.width), normalize=True)(points)
 
 
@@ -26,7 +26,7 @@ def shape_embedding(features: Array, mask: Array) -> Array:
     return jnp.where(jnp.any(mask), pooled, 0.0)
 
 
-def encode_points(config: ModelConfig, params: dict, cloud: Cloud) -> tuple[Array, Array]:
+def encode_points(config: ModelConfig, params: dict, cloud: Cloud, invariants: Array) -> tuple[Array, Array]:
     """Point embeddings (N, d) and the shape embedding e (d,) of a normalised cloud."""
-    features = run(PointEncoder(config), params, cloud.points)
+    features = run(PointEncoder(config), params, jnp.concatenate([cloud.points, invariants], axis=1))
     return features, shape_embedding(features, cloud.mask)

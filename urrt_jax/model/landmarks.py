@@ -1,9 +1,14 @@
-"""Region-aware decoders by landmarks: every region names the same few places in both clouds, and these are aligned.
+"""Region-aware decoders by landmarks: the same places are named in both clouds, and these are aligned.
 
-Decoder g_k of region k reads the region's features in both clouds and asks for C landmarks. A landmark is a soft choice
-among all points of a cloud, their mean under attention weights (keypoints as in Suwajanakorn et al. 2018, KeypointNet).
-The landmarks of all regions are matched by their number, weighed as in eq. (3), and aligned in closed form. Two clouds
-that lie on each other have the same landmarks, so the aligned pose is an exact fixed point of every step.
+A landmark is a soft choice among all points of a cloud, their mean under attention weights (keypoints as in
+Suwajanakorn et al. 2018, KeypointNet). A query says what is chosen; the points' keys are compared with it. It comes
+
+* from decoder g_k, which reads the features of region k in both clouds and asks for C landmarks, or
+* from a point, whose own key is looked up in both clouds.
+
+Landmarks are weighed (the regions' as in eq. (3)), those that disagree with the others lose weight, and the rest are
+aligned in closed form. Two clouds that lie on each other have the same landmarks, so the aligned pose is an exact fixed
+point of every step, and swapped clouds give the inverse.
 """
 
 from typing import NamedTuple
@@ -13,59 +18,132 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud
 from urrt_jax.geometry.rigid import Rigid, procrustes
 from urrt_jax.model.blocks import Perceptron, region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
 
-_STIFFNESS = 1e-3  # in a frame of unit radius: far below the spread of landmarks that mean anything
+# Lengths and areas in a frame of unit radius.
+_STIFFNESS = 1e-3  # far below the spread of landmarks that mean anything
+_TOLERANCE = 0.01  # landmarks this near to each other agree
 
 
-class Landmarks(NamedTuple):
-    """The landmarks of one cloud.
+class Queries(NamedTuple):
+    """What is asked for: M landmarks.
 
     Attributes:
-      places: (n, C, 3), in the network's frame.
-      trust: (n, C), how much each should count, before it is made positive.
+      source: (M, c), compared with the keys of the source's points.
+      target: (M, c), compared with those of the target's.
+      weights: (M,), how much each landmark should count.
     """
 
-    places: Array
-    trust: Array
+    source: Array
+    target: Array
+    weights: Array
 
 
-def key_network(config: ModelConfig) -> nn.Module:
-    """What makes the keys (N, c) of points from their embeddings (N, d)."""
+def place_keys(config: ModelConfig) -> nn.Module:
+    """What makes keys (N, key_width) of where points lie, from their embeddings (N, d)."""
     return Perceptron((2 * config.key_width, config.key_width), normalize=True)
+
+
+def surroundings_keys(config: ModelConfig) -> nn.Module:
+    """What makes keys (N, key_width) of what surrounds points, from the invariants (N, q) of that."""
+    return Perceptron((2 * config.key_width, 2 * config.key_width, config.key_width), normalize=True)
+
+
+def point_keys(config: ModelConfig, params: dict, features: Array, invariants: Array) -> Array:
+    """The keys (N, ``key_size``) of points, by which landmarks find them.
+
+    Args:
+      config: the network's.
+      params: of the decoder.
+      features: (N, d), embeddings.
+      invariants: (N, q), of the points' surroundings.
+    """
+    place = run(place_keys(config), params["keys"], features)
+    if not config.octaves:
+        return place
+    return jnp.concatenate([place, run(surroundings_keys(config), params["surroundings"], invariants)], axis=1)
+
+
+def key_size(config: ModelConfig) -> int:
+    """The dimension c of keys and queries."""
+    return (2 if config.octaves else 1) * config.key_width
 
 
 def landmark_decoders(config: ModelConfig) -> nn.Module:
     """The functions {g_k}: perceptrons with weights of their own, (n, 2d) to (n, C·(c + 1))."""
     large = nn.initializers.he_normal()  # from nearly equal queries all landmarks would be the centroid
-    return region_perceptrons((*config.decoder_widths, config.landmarks * (config.key_width + 1)), large)
+    return region_perceptrons((*config.decoder_widths, config.landmarks * (key_size(config) + 1)), large)
 
 
-def place_landmarks(
-    config: ModelConfig, params: dict, own: Array, other: Array, keys: Array, cloud: Cloud
-) -> Landmarks:
-    """The landmarks of a cloud of N points.
+def region_queries(config: ModelConfig, params: dict, source: Array, target: Array, weights: Array) -> Queries:
+    """The n·C queries of the decoders.
 
     Args:
       config: the network's.
       params: of ``landmark_decoders``.
-      own: (n, d), features of the regions of this cloud.
-      other: (n, d), of those of the other cloud.
-      keys: (N, c), of the points.
-      cloud: the points.
+      source: (n, d), features of the source's regions.
+      target: (n, d), of the target's.
+      weights: (n,), of the regions.
     """
+    (here, trust_here), (there, trust_there) = (
+        _ask(config, params, own, other) for own, other in ((source, target), (target, source))
+    )
+    # Surroundings look the same from any pose, so that both clouds are asked for the same ones.
+    alike = (here + there)[:, config.key_width :] / 2
+    first, second = (jnp.concatenate([asked[:, : config.key_width], alike], axis=1) for asked in (here, there))
+    return Queries(first, second, jax.nn.softplus(trust_here + trust_there) * jnp.repeat(weights, config.landmarks))
+
+
+def _ask(config: ModelConfig, params: dict, own: Array, other: Array) -> tuple[Array, Array]:
+    """Queries (n·C, c) for a cloud and their trust (n·C,), from the regions' features (n, d) in it and in the other."""
     asked = run(landmark_decoders(config), params, jnp.concatenate([own, other], axis=-1))
-    queries, trust = jnp.split(asked, [config.landmarks * config.key_width], axis=-1)
-    logits = queries.reshape(-1, config.key_width) @ keys.T / jnp.sqrt(config.key_width)
+    queries, trust = jnp.split(asked, [config.landmarks * key_size(config)], axis=-1)
+    return queries.reshape(-1, key_size(config)), trust.ravel()
+
+
+def point_trust() -> nn.Module:
+    """From the key (…, c) of a point, how much its landmark should count (…, 1), before it is made positive."""
+    return Perceptron((32, 1), normalize=True)
+
+
+def point_queries(config: ModelConfig, params: dict, keys: Array, real: Array) -> Queries:
+    """The queries of points of either cloud: their own keys, in both clouds.
+
+    Together they count as much as the decoders' where all are equally trusted.
+
+    Args:
+      config: the network's.
+      params: of ``point_trust``.
+      keys: (L, c).
+      real: (L,) bool; others count nothing.
+    """
+    trust = jnp.where(real, jax.nn.softplus(run(point_trust(), params, keys)[:, 0]), 0.0)
+    return Queries(keys, keys, trust * config.landmarks / jnp.maximum(jnp.sum(real), 1))
+
+
+def place_landmarks(queries: Array, keys: Array, cloud: Cloud) -> Array:
+    """Places (M, 3) in a cloud of N points, from queries (M, c) and the points' keys (N, c)."""
+    logits = queries @ keys.T / jnp.sqrt(keys.shape[1])
     attention = jax.nn.softmax(jnp.where(cloud.mask, logits, -1e9), axis=-1)
-    places = jnp.matmul(attention, cloud.points, precision=jax.lax.Precision.HIGHEST)
-    return Landmarks(places.reshape(*trust.shape, 3), trust)
+    return jnp.matmul(attention, cloud.points, precision=jax.lax.Precision.HIGHEST)
 
 
-def align_landmarks(source: Landmarks, target: Landmarks, weights: Array) -> Rigid:
-    """φ: the transform that carries the landmarks of the source onto those of the target, regions weighed by (n,)."""
-    share = jax.nn.softplus(source.trust + target.trust) * weights[:, None]
-    return procrustes(source.places.reshape(-1, 3), target.places.reshape(-1, 3), share.ravel(), stiffness=_STIFFNESS)
+def align_landmarks(source: Array, target: Array, weights: Array, *, rounds: int) -> Rigid:
+    """φ: the transform that carries landmarks (M, 3) of the source onto those of the target, with weights (M,).
+
+    In every round, landmarks at distance r after the alignment are weighed down by (1 + r²/s²)⁻², Geman and McClure's
+    weight, where s² is the mean of r² under the weights so far. The rounds multiply: what has disagreed stays light.
+    """
+
+    def agreeing(share: Array, _: None) -> tuple[Array, None]:
+        found = procrustes(source, target, share, stiffness=_STIFFNESS)
+        square = jnp.sum((rigid.apply(found, source) - target) ** 2, axis=-1)
+        share = share / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2
+        return share / jnp.maximum(jnp.sum(share), 1e-12), None
+
+    share, _ = jax.lax.scan(agreeing, weights / jnp.maximum(jnp.sum(weights), 1e-12), None, length=rounds)
+    return procrustes(source, target, share, stiffness=_STIFFNESS)

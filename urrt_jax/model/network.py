@@ -11,14 +11,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax.features.moments import invariant_count, moment_invariants
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud, denormalize_translation, normalize_pair, subsample
 from urrt_jax.geometry.rigid import Rigid
-from urrt_jax.model.attention import RegionTransformer, attend_regions
+from urrt_jax.model.attention import RegionTransformer
 from urrt_jax.model.config import ModelConfig
-from urrt_jax.model.decoder import Parts, decode, init_decoder, point_keys
-from urrt_jax.model.encoder import PointEncoder, encode_points
-from urrt_jax.model.partition import RegionBranches, Regions, branch_logits, region_labels, split_regions
+from urrt_jax.model.decoder import decode, init_decoder
+from urrt_jax.model.encoder import PointEncoder
+from urrt_jax.model.encoding import Encoding, encode_cloud
+from urrt_jax.model.partition import RegionBranches, branch_logits, region_labels
 
 
 @jax.tree_util.register_dataclass
@@ -28,20 +30,6 @@ class Model:
 
     config: ModelConfig = dataclasses.field(metadata={"static": True})
     params: dict
-
-
-class Encoding(NamedTuple):
-    """What the network knows of one cloud in one pose.
-
-    Attributes:
-      embedding: (d,), the shape embedding e.
-      regions: the cloud's regions, with the attended features a; None for model A.
-      parts: what the decoders read of it.
-    """
-
-    embedding: Array
-    regions: Regions | None
-    parts: Parts
 
 
 class Estimate(NamedTuple):
@@ -68,7 +56,8 @@ def init_model(key: Array, config: ModelConfig) -> Model:
     keys = jax.random.split(key, 4)
     n, d = config.regions, config.width
     points, embedding = jnp.zeros((1, 3)), jnp.zeros(d)
-    params = {"encoder": PointEncoder(config).init(keys[0], points)["params"]}
+    described = jnp.zeros((1, 3 + invariant_count(config.octaves)))
+    params = {"encoder": PointEncoder(config).init(keys[0], described)["params"]}
     if config.has_regions:
         sequence = jnp.zeros((n, d)), jnp.zeros((n, 3)), jnp.ones(n, bool)
         params["partition"] = RegionBranches(config).init(keys[1], points, embedding)["params"]
@@ -79,35 +68,33 @@ def init_model(key: Array, config: ModelConfig) -> Model:
 
 
 def encode(model: Model, cloud: Cloud) -> Encoding:
-    """The encoding of one normalised cloud."""
-    config, params = model.config, model.params
-    features, embedding = encode_points(config, params["encoder"], cloud)
-    keys = point_keys(config, params["decoder"], features)
-    if not config.has_regions:
-        return Encoding(embedding, None, Parts(embedding[None], jnp.sum(cloud.mask)[None], cloud, keys))
-    logits = branch_logits(config, params["partition"], cloud.points, jax.lax.stop_gradient(embedding))
-    regions = split_regions(cloud, features, region_labels(logits), config.regions)
-    attended = attend_regions(config, params["attention"], regions)
-    return Encoding(embedding, regions._replace(features=attended), Parts(attended, regions.counts, cloud, keys))
+    """The encoding of one normalised cloud, subsampled as for ``estimate``."""
+    return encode_cloud(model.config, model.params, cloud, moment_invariants(cloud, model.config.octaves))
 
 
-def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
+def estimate(model: Model, source: Cloud, target: Cloud, start: Rigid | None = None) -> Estimate:
     """The transform from source to target, of two clouds normalised together (``normalize_pair``).
 
     The network is applied ``config.steps`` times, each time to the source as moved so far; no derivative passes from
     one step to the one before it. The target is encoded once. Labels of regions carry no derivative (hard arg-max).
+    ``start`` is what the first step takes for the estimate so far; the identity where there is none. Real points should
+    come first, as ``subsample`` leaves them: among them those are chosen that are looked up.
     """
+    config, params = model.config, model.params
     target_encoding = encode(model, target)
+    invariants = moment_invariants(source, config.octaves)
 
     def step(before: Rigid, _: None) -> tuple[Rigid, tuple[Rigid, Rigid, Encoding]]:
         seen = jax.tree.map(jax.lax.stop_gradient, before)
         moved = jnp.where(source.mask[:, None], rigid.apply(seen, source.points), 0.0)
-        encoding = encode(model, source._replace(points=moved))
-        found = decode(model.config, model.params["decoder"], encoding.parts, target_encoding.parts)
-        after = rigid.compose(found, seen)
+        encoding = encode_cloud(config, params, source._replace(points=moved), invariants)
+        after = rigid.compose(decode(config, params["decoder"], encoding, target_encoding), seen)
         return after, (after, seen, encoding)
 
-    last, (steps, seen, encodings) = jax.lax.scan(step, rigid.identity(), None, length=model.config.steps)
+    begin = rigid.identity()
+    if start is not None:
+        begin = jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), start, begin)
+    last, (steps, seen, encodings) = jax.lax.scan(step, begin, None, length=config.steps)
     final_seen, final_encoding = jax.tree.map(lambda values: values[-1], (seen, encodings))
     return Estimate(last, steps, final_seen, final_encoding, target_encoding)
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.geometry.clouds import Cloud, centroid
 from urrt_jax.model.blocks import run
 from urrt_jax.model.config import ModelConfig
 
@@ -97,6 +97,13 @@ def occupancy_logits(logits: Array) -> Array:
     own logits can (Chen et al. 2019, BAE-NET).
     """
     return jnp.max(logits, axis=-1)
+
+
+def whole_region(cloud: Cloud, embedding: Array) -> Regions:
+    """The whole cloud of N points as one region, whose feature is the shape embedding (d,)."""
+    labels = jnp.zeros(cloud.mask.shape, jnp.int32)
+    real = jnp.sum(cloud.mask).astype(cloud.points.dtype)
+    return Regions(labels, real[None], embedding[None], centroid(cloud)[None])
 
 
 @jax.custom_jvp

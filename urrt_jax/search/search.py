@@ -107,9 +107,7 @@ def _from_network(model: Model, source: Cloud, target: Cloud, rotations: int) ->
     source, target = (jax.tree.map(lambda leaf: leaf[: model.config.points], cloud) for cloud in (source, target))
 
     def at(rotation: Array) -> Rigid:
-        start = Rigid(rotation, jnp.zeros(3))
-        turned = source._replace(points=rigid.apply(start, source.points))
-        return rigid.compose(estimate(model, turned, target).transform, start)
+        return estimate(model, source, target, Rigid(rotation, jnp.zeros(3))).transform
 
     return jax.lax.map(at, jnp.asarray(rotation_cover(rotations)), batch_size=8)
 

@@ -31,6 +31,9 @@ class TrainConfig:
       occupancy_queries: points at which occupancy is asked, per pair.
       chamfer_scale: scale of the Chamfer penalty, in units of the normalised pair.
       loss_points: points of each whole cloud that the Chamfer loss compares.
+      unrolled: steps of the network that training runs, at most the model's; later ones see what the last of them saw.
+      rounds: of consensus among landmarks in training, at most the model's: fresh landmarks have none to find, and many
+        rounds of it would settle on a few of them.
       steps_per_call: steps that run as one dispatch (``lax.scan``).
       seed: of the initial weights and of every pair.
     """
@@ -47,11 +50,14 @@ class TrainConfig:
     occupancy_queries: int = 256
     chamfer_scale: float = 0.1
     loss_points: int = 512
+    unrolled: int = 3
+    rounds: int = 3
     steps_per_call: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_whole(self, steps=1, batch=1, occupancy_queries=1, loss_points=1, steps_per_call=1, seed=0)
+        check_whole(self, steps=1, batch=1, occupancy_queries=1, loss_points=1)
+        check_whole(self, unrolled=1, rounds=0, steps_per_call=1, seed=0)
         check_positive(self, "learning_rate", "clip", "chamfer_scale")
         for name in ("warmup", "weight_decay", "occupancy_weight"):
             if getattr(self, name) < 0:
@@ -60,6 +66,11 @@ class TrainConfig:
             raise ValueError(f"steps_per_call: {self.steps_per_call} does not divide steps, {self.steps}")
         if self.loss_points > self.pairs.points:
             raise ValueError(f"loss_points: {self.loss_points} exceeds the {self.pairs.points} points of a pair")
+
+    def training_network(self) -> ModelConfig:
+        """The network as training runs it: with fewer steps and rounds, which are the same ones."""
+        steps, rounds = min(self.unrolled, self.model.steps), min(self.rounds, self.model.consensus)
+        return dataclasses.replace(self.model, steps=steps, consensus=rounds)
 
 
 @jax.tree_util.register_dataclass

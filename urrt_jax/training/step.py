@@ -40,7 +40,7 @@ def pair_loss(model: Model, pair: Pair, key: Array, config: TrainConfig) -> tupl
     alignment = jax.vmap(aligned)(result.steps)
     metrics = {"chamfer": alignment[-1], "chamfer_first": alignment[0]}
     loss = jnp.mean(alignment)
-    if result.target.regions is not None:
+    if config.model.has_regions:
         if pair.queries is None or pair.inside is None:
             queries, inside = shell_samples(key, whole_target, config.occupancy_queries)
         else:
@@ -66,7 +66,7 @@ def _head(cloud: Cloud, count: int) -> Cloud:
 def batch_loss(params: dict, batch: Pair, key: Array, config: TrainConfig) -> tuple[Array, Metrics]:
     """The mean objective of a batch, (), and the means of its parts; ``vmap`` over pairs happens here."""
     keys = jax.random.split(key, batch.source.points.shape[0])
-    model = Model(config.model, params)
+    model = Model(config.training_network(), params)
     losses, metrics = jax.vmap(lambda pair, pair_key: pair_loss(model, pair, pair_key, config))(batch, keys)
     return jnp.mean(losses), jax.tree.map(jnp.mean, metrics)
 

@@ -1,0 +1,46 @@
+"""What the network knows of one cloud in one pose: embeddings, regions, attended features, keys."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.model.attention import attend_regions
+from urrt_jax.model.config import ModelConfig
+from urrt_jax.model.encoder import encode_points
+from urrt_jax.model.landmarks import point_keys
+from urrt_jax.model.partition import Regions, branch_logits, region_labels, split_regions, whole_region
+
+
+class Encoding(NamedTuple):
+    """One cloud as the decoders see it.
+
+    Attributes:
+      cloud: N points, normalised.
+      embedding: (d,), the shape embedding e.
+      regions: its regions, with the attended features a; for model A a single one with the shape embedding.
+      keys: (N, c), by which landmarks find points; (N, 0) where decoders give poses.
+    """
+
+    cloud: Cloud
+    embedding: Array
+    regions: Regions
+    keys: Array
+
+
+def encode_cloud(config: ModelConfig, params: dict, cloud: Cloud, invariants: Array) -> Encoding:
+    """The encoding of a normalised cloud of N points with the invariants (N, q) of their surroundings."""
+    features, embedding = encode_points(config, params["encoder"], cloud, invariants)
+    if config.has_regions:
+        logits = branch_logits(config, params["partition"], cloud.points, jax.lax.stop_gradient(embedding))
+        regions = split_regions(cloud, features, region_labels(logits), config.regions)
+        regions = regions._replace(features=attend_regions(config, params["attention"], regions))
+    else:
+        regions = whole_region(cloud, embedding)
+    if config.decoder == "pose":
+        keys = jnp.zeros((features.shape[0], 0), features.dtype)
+    else:
+        keys = point_keys(config, params["decoder"], features, invariants)
+    return Encoding(cloud, embedding, regions, keys)
