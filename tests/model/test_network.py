@@ -90,9 +90,9 @@ def test_padding_changes_nothing(model, pair, x64):
     _close(found, _predict(model, *map(make_cloud, pair)), atol=1e-9)
 
 
-def test_jit_agrees_with_eager(small_model, pair):
+def test_jit_agrees_with_eager(small_model, pair, x64):
     clouds = tuple(map(make_cloud, pair))
-    _close(_predict(small_model, *clouds), predict(small_model, *clouds))
+    _close(_predict(small_model, *clouds), predict(small_model, *clouds), atol=1e-9)
 
 
 def test_vmap_agrees_with_a_loop(model, pair, cloud, x64):
