@@ -14,7 +14,7 @@ from jax import Array
 
 from urrt_jax.geometry.clouds import Cloud
 
-_ROWS = 64
+_ROWS = 64  # points a block
 _FLAT = 1e-4  # added to what a root is taken of, whose slope is infinite at zero
 _NEAR = 0.05  # of a width: means nearer than this have no direction
 _FINEST = 0.1  # of the unit radius: about the distance of neighbours among 512 points of a surface
