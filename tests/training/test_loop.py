@@ -17,6 +17,7 @@ from urrt_jax.training.loop import Log, LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig, init_state
 from urrt_jax.training.step import train_steps
+from urrt_jax.training.validation import validate, validation_pairs
 
 _CONFIG = TrainConfig(
     model=ModelConfig(
@@ -145,6 +146,16 @@ def test_only_the_asked_steps_and_rounds_are_trained(arrays):
     first, _ = train_steps(_fresh(few), arrays, few)
     second, _ = train_steps(_fresh(many), arrays, dataclasses.replace(many, unrolled=1, rounds=0))
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
+
+
+def test_validation_runs_the_steps_that_use_runs(arrays):
+    """However few of them are trained."""
+    config = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=3), unrolled=1)
+    params, pairs = _fresh(config).params, validation_pairs(config, arrays, 4)
+    found = validate(params, pairs, config)
+    assert found == validate(params, pairs, dataclasses.replace(config, unrolled=3))
+    one_step = dataclasses.replace(config, model=dataclasses.replace(config.model, steps=1))
+    assert found["clean_chamfer"] != validate(params, pairs, one_step)["clean_chamfer"]
 
 
 def test_a_step_changes_the_parameters(arrays):
