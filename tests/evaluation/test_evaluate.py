@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from urrt_jax import register
-from urrt_jax.evaluation import PROTOCOLS, Ours, Poses, evaluate, find_method, load_evaluation, spread
+from urrt_jax import register, save_model
+from urrt_jax.evaluation import PROTOCOLS, Ours, Poses, evaluate, find_method, load_evaluation, spread, values_path
 from urrt_jax.peers import PrincipalAxes
+
+ITEMS = np.arange(5)
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +28,19 @@ def evaluation(small_model, clouds):
 
 def identity(source, target):
     return np.eye(4)
+
+
+def test_a_method_may_name_its_model(clouds, small_model, tmp_path):
+    path = save_model(small_model, tmp_path / "mine.npz")
+    named, plain = find_method(f"network:{path}"), find_method("network")
+    assert named.title == "ours, network alone (mine)"
+    assert named.identity() == Ours(model=small_model, refine=None).identity() != plain.identity()
+    assert find_method(f"network:{path}", model="modelnet40").identity() == named.identity()
+    kept = evaluate(named, "dcp", clouds, save=values_path(tmp_path, f"network:{path}", named, "dcp", clouds, ITEMS))
+    assert len(kept) == len(list(tmp_path.glob("dcp-network-*.npz"))) * 5
+    for wrong in ("network:nothing", "network:", "icp:modelnet40"):
+        with pytest.raises(ValueError, match=r"expected one of|no packaged model"):
+            find_method(wrong)
 
 
 def test_every_item_is_evaluated_once_though_the_last_batch_is_short(evaluation):

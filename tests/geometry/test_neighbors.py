@@ -90,6 +90,13 @@ def test_nearest_gradient_agrees_with_finite_differences(moves, x64):
     assert float(jax.grad(total)(0.0)) == pytest.approx(float(total(1e-6) - total(-1e-6)) / 2e-6, rel=1e-6)
 
 
+@pytest.mark.parametrize("count", [5, 5000])
+def test_no_queries_have_no_neighbours(count):
+    reference, nothing = make_cloud(np.random.default_rng(0).normal(size=(count, 3))), jnp.zeros((0, 3))
+    for found in (nearest(nothing, reference), k_nearest(nothing, reference, 2)):
+        assert len(found.index) == len(found.squared) == 0
+
+
 def test_nearest_jit_agrees_with_eager():
     query, reference = _pair(83, 100)
     eager, jitted = nearest(jnp.asarray(query), make_cloud(reference)), jax.jit(nearest)(query, make_cloud(reference))

@@ -180,6 +180,18 @@ def test_landmarks_that_disagree_lose_their_weight(pose):
     assert errors[2] < 2e-3
 
 
+def test_noise_leaves_the_weight_to_many_landmarks(pose):
+    """Weights that multiply over the rounds end with three landmarks, and with many times the error."""
+    truth, errors = jnp.asarray(pose[0], jnp.float32), []
+    for seed in range(10):
+        source = _landmarks(seed)
+        target = source @ pose[0].T + pose[1] + 0.05 * _landmarks(seed + 100)
+        found = [align_landmarks(source, target, _weights(), rounds=k).rotation for k in (0, 40)]
+        errors.append([float(rigid.rotation_angle(rotation, truth)) for rotation in found])
+    plain, agreed = np.mean(errors, axis=0)
+    assert agreed < 3 * plain
+
+
 def test_landmarks_in_one_place_turn_nothing():
     """Rounding alone would otherwise choose the rotation."""
     source, target = (jnp.ones((20, 3)) + 1e-6 * _landmarks(k) for k in (1, 2))

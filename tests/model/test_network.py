@@ -327,6 +327,16 @@ def test_labels_have_no_derivative(small_model, pair):
     assert not bool(jnp.any(jax.grad(total)(jnp.asarray(pair[0]))))
 
 
+def test_branches_read_the_direction_of_the_shape_embedding(small_model, pair):
+    def logits(embedding):
+        return branch_logits(small_model.config, small_model.params["partition"], jnp.asarray(pair[0]), embedding)
+
+    embedding = jax.random.normal(jax.random.key(0), (16,))
+    np.testing.assert_allclose(logits(embedding), logits(7 * embedding), atol=1e-4)
+    assert float(jnp.max(jnp.abs(logits(embedding) - logits(-embedding)))) > 1e-2
+    assert bool(jnp.all(jnp.isfinite(jax.grad(lambda e: jnp.sum(logits(e)))(jnp.zeros(16)))))  # an empty cloud's
+
+
 def test_occupancy_can_say_outside():
     assert float(occupancy_logits(jnp.array([-3.0, -5.0]))) == -3
 

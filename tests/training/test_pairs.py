@@ -150,7 +150,8 @@ def test_euler_rotation_about_one_axis_is_right_handed():
     ("progress", "share"), [(0.0, 0.0), (0.3, 0.0), (0.35, 0.375), (0.4, 0.75), (0.7, 0.75), (1.0, 0.75)]
 )
 def test_corruption_share_follows_the_schedule(progress, share):
-    assert float(corruption_share(PairConfig(), progress)) == pytest.approx(share, abs=1e-5)
+    config = PairConfig(clean_share=0.3, ramp_share=0.1)
+    assert float(corruption_share(config, progress)) == pytest.approx(share, abs=1e-5)
 
 
 def test_corruption_share_without_a_ramp_is_a_step():

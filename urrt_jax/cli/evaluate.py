@@ -23,9 +23,9 @@ class Evaluate:
             incomplete_both, drift, drift_target, outliers, independent, independent_noise, scans. Options follow the
             name, as in 'outliers share=0.2'.
         methods: network, register and search are ours: alone, refined, and after a search within 90° (search_all: among
-            all rotations). identity and principal_axes need nothing; icp, icp_identity, icp_plane, gicp, fgr, fgr_icp,
-            ransac, ransac_icp, kiss, and on scans scan_icp, scan_fgr, scan_ransac, scan_kiss need 'urrt-jax[peers]';
-            goicp says how to install it.
+            all rotations); a model of its own may follow, as in network:modelnet40-paper. identity and principal_axes
+            need nothing; icp, icp_identity, icp_plane, gicp, fgr, fgr_icp, ransac, ransac_icp, kiss, and on scans
+            scan_icp, scan_fgr, scan_ransac, scan_kiss need 'urrt-jax[peers]'; goicp says how to install it.
         model: Ours: name of a packaged model, or a file written by 'urrt train'.
         limit: At most so many items, evenly spread.
         points: Points of each shape.
@@ -49,7 +49,7 @@ class Evaluate:
 
         from urrt_jax import __version__, model_card
         from urrt_jax.atomic import write_atomically
-        from urrt_jax.cli.printing import changed_flags, print_skipped
+        from urrt_jax.cli.printing import changed_flags, print_skipped, without_folder
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.evaluation import evaluate, find_method, find_protocol, load_scan_pairs, spread, values_path
 
@@ -59,8 +59,9 @@ class Evaluate:
         if not methods:
             raise ValueError("methods: name at least one")
         spread(1, self.limit)
-        for method in methods.values():
-            method.identity()
+        identities = {without_folder(name): method.identity() for name, method in methods.items()}
+        if len(identities) < len(methods):
+            raise ValueError("methods: models of one file name would share a column; copy them to different names")
         card, source = model_card(self.model), find_data(self.data)
         if self.protocol.split()[0] == "scans":
             pairs, _ = load_scan_pairs(source)
@@ -77,8 +78,8 @@ class Evaluate:
             save.parent.mkdir(exist_ok=True)
             batch = self.batch if method.batch > 1 else None
             found = evaluate(method, self.protocol, pairs, items=items, save=save, batch=batch)
-            figures[name] = found.summary()
-            failures[name] = {str(item): reason for item, reason in found.failures.items()}
+            figures[without_folder(name)] = found.summary()
+            failures[without_folder(name)] = {str(item): reason for item, reason in found.failures.items()}
         # Names only: a results file is for other people, too.
         settings = {
             "command": shlex.join(["urrt", "evaluate", *changed_flags(self)]),
@@ -92,6 +93,7 @@ class Evaluate:
             "protocol": self.protocol,
             "items": len(items),
             "seed": "the number of each item",
+            "methods": identities,
         }
         print(figures_table(figures))
         write_atomically(
@@ -105,8 +107,11 @@ def figures_table(figures: dict[str, dict[str, Any]]) -> str:
     """The figures as text: a row a figure, a column a method."""
     rows = list(dict.fromkeys(row for each in figures.values() for row in each))
     width = max(map(len, rows)) + 2
-    lines = [" " * width + "".join(f"{name:>16}" for name in figures)]
-    lines += [f"{row:<{width}}" + "".join(f"{_short(each.get(row)):>16}" for each in figures.values()) for row in rows]
+    columns = {name: max(16, len(name) + 2) for name in figures}
+    lines = [" " * width + "".join(f"{name:>{wide}}" for name, wide in columns.items())]
+    for row in rows:
+        cells = (f"{_short(figures[name].get(row)):>{wide}}" for name, wide in columns.items())
+        lines.append(f"{row:<{width}}" + "".join(cells))
     return "\n".join(lines)
 
 

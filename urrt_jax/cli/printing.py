@@ -66,8 +66,12 @@ def changed_flags(flags: Any, prefix: str = "") -> list[str]:
             typed.append(f"--{name}")
         elif value != field.default:
             values = value if isinstance(value, tuple) else (value,)
-            typed += [
-                f"--{name}",
-                *(Path(each).name if name in ("out", "data", "model") else str(each) for each in values),
-            ]
+            paths = name in ("out", "data", "model")
+            typed += [f"--{name}", *(Path(each).name if paths else without_folder(str(each)) for each in values)]
     return typed
+
+
+def without_folder(method: str) -> str:
+    """A method's name with no more than the name of the file of its own model, as in "network:model.npz"."""
+    stages, colon, own = method.partition(":")
+    return stages + colon + Path(own).name if own else method

@@ -17,7 +17,7 @@ class Reproduce:
     libraries need 'urrt-jax[peers]'; a missing one is a row that says how to install it.
 
     Attributes:
-        table: table1, table2, table3, figure4, beyond, or a folder with a config.toml of your own.
+        table: table1, table2, table3, figure4, beyond, unseen, or a folder with a config.toml of your own.
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, else
             'procedural'. Tables beyond the paper look for bunny_scans.npz and a set of 2,048 points a shape in it.
         out: Folder to write; by default reproduced/TABLE.

@@ -44,10 +44,10 @@ class NetworkFlags:
     attention_layers: int = 1
     decoder: Literal["landmarks", "pose"] = "landmarks"
     landmarks: int = 8
-    sharpness: float = 1.0
-    octaves: int = 0
-    lookups: int = 0
-    consensus: int = 0
+    sharpness: float = 4.0
+    octaves: int = 4
+    lookups: int = 256
+    consensus: int = 12
     steps: int = 3
     points: int = 512
 
@@ -62,7 +62,7 @@ class PairFlags:
         signed: Share of pairs whose angles take random signs; the others turn one way only, as in DCP's protocol.
         translation: Largest translation along each axis.
         both_ways: Share of pairs whose source is the turned cloud; in the others it is the target, as in DCP's.
-        clean_share: First share of the steps in which all pairs are clean; that learns faster.
+        clean_share: First share of the steps in which all pairs are clean.
         ramp_share: Share of the steps in which spoiled pairs come in.
         corrupted: Share of pairs that are spoiled after that.
         noise: Largest standard deviation of the noise on every coordinate.
@@ -75,7 +75,7 @@ class PairFlags:
     signed: float = 0.5
     translation: float = 0.5
     both_ways: float = 0.5
-    clean_share: float = 0.3
+    clean_share: float = 0.0
     ramp_share: float = 0.1
     corrupted: float = 0.75
     noise: float = 0.02
@@ -95,6 +95,7 @@ class Train:
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, else
             'procedural'.
         limit: At most so many shapes.
+        categories: Only shapes of the first so many categories; the others stay unseen.
         queries: Points a shape whose inside and outside teach the regions, where meshes are closed; 0 uses a shell
             around the cloud instead.
         validation_share: Share of the training shapes that is held out to choose the best checkpoint by.
@@ -105,7 +106,7 @@ class Train:
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
         unrolled: Of the network's steps, so many are trained; the later ones see what the last of these saw.
-        rounds: Of consensus among landmarks in training, at most the model's; many keep fresh landmarks from learning.
+        rounds: Of consensus among landmarks in training, at most the model's; fresh landmarks have none to find.
         steps_per_call: Steps in one dispatch; more of them help on an accelerator.
         seed: Of the first weights and of every pair.
         every: Steps between validations, each followed by a checkpoint.
@@ -119,15 +120,16 @@ class Train:
     out: Path
     data: str | None = None
     limit: int | None = None
+    categories: int | None = None
     queries: int = 0
     validation_share: float = 0.05
-    steps: int = 10_000
+    steps: int = 5_000
     batch: int = 32
     learning_rate: float = 1e-3
     warmup: int = 200
     occupancy_weight: float = 0.02
     loss_points: int = 512
-    unrolled: int = 3
+    unrolled: int = 2
     rounds: int = 3
     steps_per_call: int = 1
     seed: int = 0
@@ -170,6 +172,8 @@ class Train:
             patience=self.patience,
         )
         loaded = load_shapes(source, points=self.pairs.points, limit=self.limit, queries=self.queries, progress=True)
+        if self.categories is not None:
+            loaded = loaded.first_categories(self.categories)
         shapes, validation = loaded.split_validation(self.validation_share, self.seed)
         print(f"{len(shapes)} shapes to train on, {len(validation)} held out")
         print_skipped(loaded.skipped)

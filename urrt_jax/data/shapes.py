@@ -74,6 +74,13 @@ class Shapes:
             inside=None if self.inside is None else self.inside[indices],
         )
 
+    def first_categories(self, count: int) -> Shapes:
+        """The shapes of the first `count` categories, by label; `ValueError` where these are none, or all."""
+        rows = np.flatnonzero(self.labels < count)
+        if not 0 < len(rows) < len(self):
+            raise ValueError(f"categories: expected some of the {len(self.classes)} here, and not all, got {count}")
+        return self.take(rows)
+
     def split_validation(self, fraction: float, seed: int) -> tuple[Shapes, Shapes]:
         """Two disjoint sets (train, validation): a share held out to choose models by, the same for the same seed.
 

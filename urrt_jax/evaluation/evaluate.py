@@ -140,7 +140,7 @@ def evaluate(
     all along, also when the run is interrupted, and the same call continues after the last item there.
 
     Args:
-      method: a name (``"register"``, ``"network"``, one in ``PEERS``), a ``Model``, or a function from a source (N, 3)
+      method: a name as ``find_method`` takes it, a ``Model``, or a function from a source (N, 3)
         and a target (M, 3) to the matrix (4, 4) of the pose.
       protocol: a name in ``PROTOCOLS``, with options: ``"drift sigma=0.02"``.
       data: (S, P, 3) shapes in the unit sphere, item i being shape i; for ``"scans"``, the trials of
@@ -200,6 +200,8 @@ def values_path(folder: Path, name: str, method: Method, protocol: str, data: An
     """A file for the values of an evaluation, named by the method, the protocol and a digest of all they depend on."""
     described = json.dumps([method.identity(), protocol, data_digest(data), items.tolist()], sort_keys=True)
     digest = hashlib.sha256(described.encode()).hexdigest()[:10]
+    stages, _, own = name.partition(":")
+    name = f"{stages}-{Path(own).stem}" if own else name
     return folder / f"{protocol.replace(' ', '_')}-{name}-{digest}.npz"
 
 

@@ -138,9 +138,9 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
 
     Args:
       method: ``"network"``, ``"register"`` and ``"search"`` are ours: alone, refined, and refined after a global search
-        over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans); the
-        others are the names in ``PEERS``.
-      model: what ours uses: a packaged name or a file.
+        over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans); a
+        model of its own may follow, as in ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
+      model: what ours uses where the name says nothing of it: a packaged name or a file.
 
     Raises:
       ValueError: there is no such method or model.
@@ -149,12 +149,14 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
         return Ours(model=method)
     if isinstance(method, Peer):
         return PairByPair(function=method.align_pair, title=method.title, settings=method.settings, peer=method)
-    if isinstance(method, str) and method in _OURS:
-        refine, search, batch = _OURS[method]
-        return Ours(model=load_model(model), refine=refine, search=search, name=Path(model).stem, batch=batch)
     if isinstance(method, str):
+        stages, colon, own = method.partition(":")
+        if stages in _OURS and bool(colon) == bool(own):
+            (refine, search, batch), used = _OURS[stages], own or model
+            return Ours(model=load_model(used), refine=refine, search=search, name=_short_name(used), batch=batch)
         if method not in PEERS:
-            raise ValueError(f"method: expected one of {', '.join((*_OURS, *PEERS))}, got {method!r}")
+            ours, others = ", ".join(_OURS), ", ".join(PEERS)
+            raise ValueError(f"method: expected one of {ours} (or one with :MODEL), {others}, got {method!r}")
         return find_method(PEERS[method])
     if hasattr(method, "align"):
         return method  # type: ignore[return-value]
@@ -188,6 +190,12 @@ def _stack(clouds: Sequence[np.ndarray]) -> tuple[Array, Array]:
     if size > _LARGE:
         size = -(-size // _BLOCK) * _BLOCK
     return pad_clouds(clouds, size=size)
+
+
+def _short_name(model: str | Path) -> str:
+    """What titles call a model: the name of its run, where training wrote "model.npz"."""
+    path = Path(model)
+    return path.parent.name if path.stem == "model" and path.parent.name else path.stem
 
 
 def _digest(model: Model) -> str:

@@ -60,6 +60,8 @@ def nearest_in_blocks(query: Array, blocks: Blocks, within: Array | float, disti
       distinct: pass over points that coincide with the query.
     """
     count = query.shape[0]
+    if not count:
+        return jnp.zeros(0, jnp.int32), jnp.zeros(0, bool)
     tile = min(_TILE, count)
     order = curve_order(query, jnp.ones(count, bool))
     tiles = jnp.pad(query[order], ((0, -count % tile), (0, 0)), mode="edge").reshape(-1, tile, 3)

@@ -148,7 +148,7 @@ def k_nearest(query: Array, reference: Cloud, k: int, *, batch_size: int | None 
     if batch_size is None:
         index = jax.vmap(one)(fixed)
     else:
-        index = jax.lax.map(one, fixed, batch_size=min(batch_size, query.shape[0]))
+        index = jax.lax.map(one, fixed, batch_size=min(batch_size, max(1, query.shape[0])))
     squared = jnp.sum((query[:, None] - reference.points[index]) ** 2, axis=-1)
     return Neighbors(index, jnp.where(reference.mask[index], squared, jnp.inf))
 

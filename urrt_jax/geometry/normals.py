@@ -63,21 +63,22 @@ def least_axis(spread: Array) -> Array:
     then is singular. Where the two smallest eigenvalues agree, that vanishes, and any direction across the longest row
     will do; z for a multiple of the identity.
     """
+    axes = jnp.eye(3, dtype=spread.dtype)
     largest = jnp.max(jnp.abs(spread))
     spread = spread / jnp.where(largest > 0, largest, 1.0)
     mean = jnp.trace(spread) / 3
-    rest = spread - mean * jnp.eye(3)
+    rest = spread - mean * axes
     size = jnp.sqrt(jnp.maximum(jnp.sum(rest**2) / 6, 1e-30))
     rest = rest / size
     angle = jnp.arccos(jnp.clip(jnp.linalg.det(rest) / 2, -1.0, 1.0)) / 3
-    rows = rest - 2 * jnp.cos(angle + 2 * jnp.pi / 3) * jnp.eye(3)
+    rows = rest - 2 * jnp.cos(angle + 2 * jnp.pi / 3) * axes
     crosses = jnp.stack([jnp.cross(rows[0], rows[1]), jnp.cross(rows[1], rows[2]), jnp.cross(rows[2], rows[0])])
     longest = crosses[jnp.argmax(jnp.sum(crosses**2, axis=-1))]
     row = rows[jnp.argmax(jnp.sum(rows**2, axis=-1))]
-    across = jnp.cross(row, jnp.eye(3)[jnp.argmin(jnp.abs(row))])
+    across = jnp.cross(row, axes[jnp.argmin(jnp.abs(row))])
     vector = jnp.where(jnp.linalg.norm(longest) > _SINGULAR, longest, across)
     length = jnp.linalg.norm(vector)
-    return jnp.where(length > _SINGULAR, vector / jnp.maximum(length, _SINGULAR), jnp.array([0.0, 0.0, 1.0]))
+    return jnp.where(length > _SINGULAR, vector / jnp.maximum(length, _SINGULAR), axes[2])
 
 
 @least_axis.defjvp
@@ -87,10 +88,11 @@ def _least_axis_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
     vector = least_axis(spread)
     least = vector @ jnp.matmul(spread, vector, precision=_HIGHEST)
     # In closed form in the plane across the vector: batches of LAPACK's eigh may wait for each other for ever on a CPU.
-    first = jnp.cross(vector, jnp.eye(3)[jnp.argmin(jnp.abs(vector))])
+    first = jnp.cross(vector, jnp.eye(3, dtype=vector.dtype)[jnp.argmin(jnp.abs(vector))])
     first /= jnp.linalg.norm(first)
     plane = jnp.stack([first, jnp.cross(vector, first)])
-    above = jnp.matmul(plane, jnp.matmul(spread, plane.T, precision=_HIGHEST), precision=_HIGHEST) - least * jnp.eye(2)
+    above = jnp.matmul(plane, jnp.matmul(spread, plane.T, precision=_HIGHEST), precision=_HIGHEST)
+    above -= least * jnp.eye(2, dtype=least.dtype)
     along = jnp.matmul(plane, jnp.matmul(change, vector, precision=_HIGHEST), precision=_HIGHEST)
     determinant = above[0, 0] * above[1, 1] - above[0, 1] * above[1, 0]
     usable = determinant > 1e-3 * jnp.maximum(jnp.trace(above) ** 2, jnp.finfo(spread.dtype).tiny)

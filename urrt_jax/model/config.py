@@ -44,10 +44,10 @@ class ModelConfig:
     decoder_widths: tuple[int, ...] = (128,)
     landmarks: int = 8
     key_width: int = 32
-    sharpness: float = 1.0
-    octaves: int = 0
-    lookups: int = 0
-    consensus: int = 0
+    sharpness: float = 4.0
+    octaves: int = 4
+    lookups: int = 256
+    consensus: int = 12
     steps: int = 3
     points: int = 512
 

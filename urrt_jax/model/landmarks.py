@@ -127,23 +127,29 @@ def point_queries(config: ModelConfig, params: dict, keys: Array, real: Array) -
 
 def place_landmarks(queries: Array, keys: Array, cloud: Cloud) -> Array:
     """Places (M, 3) in a cloud of N points, from queries (M, c) and the points' keys (N, c)."""
-    logits = queries @ keys.T / jnp.sqrt(keys.shape[1])
-    attention = jax.nn.softmax(jnp.where(cloud.mask, logits, -1e9), axis=-1)
-    return jnp.matmul(attention, cloud.points, precision=jax.lax.Precision.HIGHEST)
+    logits = jnp.where(cloud.mask, (queries / jnp.sqrt(keys.shape[1])) @ keys.T, -1e9)
+    shares = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
+    # A softmax, but its sums are made with those of the points: one passage over the matrix less.
+    summed = jnp.concatenate([cloud.points, jnp.ones_like(cloud.points[:, :1])], axis=1)
+    places = jnp.matmul(shares, summed, precision=jax.lax.Precision.HIGHEST)
+    return places[:, :3] / places[:, 3:]
 
 
 def align_landmarks(source: Array, target: Array, weights: Array, *, rounds: int) -> Rigid:
     """φ: the transform that carries landmarks (M, 3) of the source onto those of the target, with weights (M,).
 
     In every round, landmarks at distance r after the alignment are weighed down by (1 + r²/s²)⁻², Geman and McClure's
-    weight, where s² is the mean of r² under the weights so far. The rounds multiply: what has disagreed stays light.
+    weight, where s² is the mean of r² under the weights of the round before: it shrinks as what disagrees grows light.
+    A round starts from the weights that were given. Were they to multiply, noise would leave a handful of landmarks.
     """
+
+    def shares(values: Array) -> Array:
+        return values / jnp.maximum(jnp.sum(values), 1e-12)
 
     def agreeing(share: Array, _: None) -> tuple[Array, None]:
         found = procrustes(source, target, share, stiffness=_STIFFNESS)
         square = jnp.sum((rigid.apply(found, source) - target) ** 2, axis=-1)
-        share = share / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2
-        return share / jnp.maximum(jnp.sum(share), 1e-12), None
+        return shares(weights / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2), None
 
-    share, _ = jax.lax.scan(agreeing, weights / jnp.maximum(jnp.sum(weights), 1e-12), None, length=rounds)
+    share, _ = jax.lax.scan(agreeing, shares(weights), None, length=rounds)
     return procrustes(source, target, share, stiffness=_STIFFNESS)

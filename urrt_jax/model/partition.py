@@ -33,7 +33,7 @@ class Regions(NamedTuple):
 
 
 class RegionBranches(nn.Module):
-    """The functions {h_k} of eq. (1): n perceptrons of [x, e] with one hidden layer, each with weights of its own.
+    """The functions {h_k} of eq. (1): n perceptrons of [x, e/‖e‖] with one hidden layer, each with weights of its own.
 
     The hidden layer is split into a part for x and a part for e, which is the same layer, but e's part is computed once
     a shape instead of once a point; the branches' hidden layers run side by side as one wide layer.
@@ -52,7 +52,10 @@ class RegionBranches(nn.Module):
         directions = self.param("directions", _unit_columns, (3, n * width))
         offsets = self.param("offsets", lambda _: -jnp.sum(directions * jnp.repeat(anchors(n), width, 0).T, axis=0))
         faint = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
-        shape = nn.Dense(n * width, use_bias=False, kernel_init=faint, name="shape")(embedding)
+        # Only e's direction, as long as x: a step of Adam would move the branches farther through e than through x, all
+        # shapes would look alike to them, and few regions would stay in use.
+        direction = embedding / jnp.sqrt(jnp.sum(embedding**2) + 1e-6)
+        shape = nn.Dense(n * width, use_bias=False, kernel_init=faint, name="shape")(direction)
         # A unit looking along u rises by |x|/4 on average over all directions u: the sum falls by 4 a unit of length.
         out = self.param("out", nn.initializers.constant(-16.0 / width), (n, width, 1))
         bias = self.param("bias", nn.initializers.constant(2.0), (n,))

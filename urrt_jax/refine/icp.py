@@ -66,14 +66,16 @@ def icp(
       reach: the distance within which ``initial`` can be trusted, where it is known: the first stage is then left out.
       small: even subsamples of both clouds (``subsample``), at least twice ``config.coarse_points``, if they are there.
     """
-    source, target, transform = prepare(source), prepare(target), jax.tree.map(jax.lax.stop_gradient, initial)
+    source, target = prepare(source), prepare(target)
+    precision = source.cloud.points.dtype
+    transform = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf).astype(precision), initial)
     if reach is None and config.coarse_points:
         if small is None:
             size = 2 * config.coarse_points
             small = subsample(source.cloud, size, order=source.order), subsample(target.cloud, size, order=target.order)
         transform, reach = _find_basin(*small, transform, config)
     elif reach is None:
-        reach = jnp.array(config.reach)
+        reach = jnp.array(config.reach, precision)
     return _settle(source, target, transform, reach, config)
 
 
@@ -106,7 +108,8 @@ def _find_basin(source: Cloud, target: Cloud, initial: Rigid, config: ICP) -> tu
     # Farthest-point samples: their first points are a coarser one.
     source, target = _first(source, config.coarse_points), _first(target, 2 * config.coarse_points)
     floor = jnp.maximum(spacing(target), 1e-6)  # points may all coincide
-    found = anneal(source, target, initial, jnp.array(config.reach), floor, iterations=config.coarse_iterations)
+    reach = jnp.array(config.reach, floor.dtype)
+    found = anneal(source, target, initial, reach, floor, iterations=config.coarse_iterations)
     return found, floor
 
 
@@ -153,7 +156,8 @@ def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, co
     # The end is where this gradient vanishes; how that place moves with the points is all that derivatives need.
     rest = jax.lax.custom_root(
         gradient,
-        jnp.where(end.settled, jnp.zeros(6), 0.0),  # depends on the pair: custom_root's guess must be batched with it
+        # Depends on the pair: custom_root's guess must be batched with it.
+        jnp.where(end.settled, jnp.zeros(6, floor.dtype), 0.0),
         solve=lambda _, motion: motion,
         tangent_solve=lambda linear, value: damped_solve(jax.jacobian(linear)(value), value),
     )

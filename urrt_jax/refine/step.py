@@ -31,8 +31,8 @@ def normal_equations(pairs: Pairs, weights: Array, plane: float) -> tuple[Array,
     middle = (pairs.source + pairs.target) / 2  # a normal turns with the point that it belongs to: on average, half
     directions = [(plane, pairs.normals)] if plane else []
     if plane < 1:
-        directions += [(1 - plane, jnp.broadcast_to(axis, apart.shape)) for axis in jnp.eye(3)]
-    matrix, gradient = jnp.zeros((6, 6)), jnp.zeros(6)
+        directions += [(1 - plane, jnp.broadcast_to(axis, apart.shape)) for axis in jnp.eye(3, dtype=apart.dtype)]
+    matrix, gradient = jnp.zeros((6, 6), apart.dtype), jnp.zeros(6, apart.dtype)
     for share, direction in directions:
         lever = jnp.concatenate([direction, jnp.cross(middle, direction)], axis=-1)
         weighted = (share * weights)[:, None] * lever
@@ -44,7 +44,7 @@ def normal_equations(pairs: Pairs, weights: Array, plane: float) -> tuple[Array,
 def damped_solve(matrix: Array, vector: Array) -> Array:
     """The solution (6,) of a linear system whose matrix (6, 6) may be singular, as degenerate clouds make it."""
     damping = _DAMPING * jnp.trace(jnp.abs(matrix)) / 6 + _LEAST_DAMPING
-    return jnp.linalg.solve(matrix + damping * jnp.eye(6), vector)
+    return jnp.linalg.solve(matrix + damping * jnp.eye(6, dtype=matrix.dtype), vector)
 
 
 def bounded_step(matrix: Array, gradient: Array) -> Array:
@@ -57,4 +57,6 @@ def bounded_step(matrix: Array, gradient: Array) -> Array:
 def move(motion: Array, transform: Rigid) -> Rigid:
     """The transform followed by a motion (6,): translation and rotation vector, by SE(3)'s exponential map."""
     moved = jaxlie.SE3.exp(motion)
-    return rigid.compose(Rigid(moved.rotation().as_matrix(), moved.translation()), transform)
+    moved = Rigid(moved.rotation().as_matrix(), moved.translation())
+    # jaxlie answers in double precision wherever that is on.
+    return rigid.compose(jax.tree.map(lambda leaf: leaf.astype(motion.dtype), moved), transform)

@@ -78,14 +78,17 @@ def _varies(part: dict[str, Any], name: str) -> bool:
 
 
 def _styles(results: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """How to draw each method, the same in every panel: ours in red, on top."""
+    """How to draw each method, the same in every panel: ours in red, on top, dashed with a model of its own."""
     names = [row["method"] for part in (*results["parts"], *results["sweeps"]) for row in part["rows"]]
-    peers = [name for name in dict.fromkeys(names) if name not in _OURS]
-    styles = {
-        name: {"color": color, "linewidth": 1.2, "zorder": 2}
-        for name, color in zip(peers, itertools.cycle(_COLORS), strict=False)
-    }
-    return styles | {name: {"color": color, "linewidth": 2.2, "zorder": 3} for name, color in _OURS.items()}
+    colors, styles = itertools.cycle(_COLORS), {}
+    for name in dict.fromkeys(names):
+        stages, _, own = name.partition(":")
+        if stages in _OURS:
+            dashes = "--" if own else "-"
+            styles[name] = {"color": _OURS[stages], "linewidth": 2.2, "linestyle": dashes, "zorder": 3}
+        else:
+            styles[name] = {"color": next(colors), "linewidth": 1.2, "zorder": 2}
+    return styles
 
 
 def _measured(part: dict[str, Any]) -> list[dict[str, Any]]:

@@ -40,7 +40,7 @@ class PairConfig:
     signed: float = 0.5
     translation: float = 0.5
     both_ways: float = 0.5
-    clean_share: float = 0.3
+    clean_share: float = 0.0
     ramp_share: float = 0.1
     corrupted: float = 0.75
     noise: float = 0.02

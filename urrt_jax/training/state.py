@@ -32,15 +32,14 @@ class TrainConfig:
       chamfer_scale: scale of the Chamfer penalty, in units of the normalised pair.
       loss_points: points of each whole cloud that the Chamfer loss compares.
       unrolled: steps of the network that training runs, at most the model's; later ones see what the last of them saw.
-      rounds: of consensus among landmarks in training, at most the model's: fresh landmarks have none to find, and many
-        rounds of it would settle on a few of them.
+      rounds: of consensus among landmarks in training, at most the model's: fresh landmarks have none to find.
       steps_per_call: steps that run as one dispatch (``lax.scan``).
       seed: of the initial weights and of every pair.
     """
 
     model: ModelConfig = ModelConfig()
     pairs: PairConfig = PairConfig()
-    steps: int = 10_000
+    steps: int = 5_000
     batch: int = 32
     learning_rate: float = 1e-3
     warmup: int = 200
@@ -50,7 +49,7 @@ class TrainConfig:
     occupancy_queries: int = 256
     chamfer_scale: float = 0.1
     loss_points: int = 512
-    unrolled: int = 3
+    unrolled: int = 2
     rounds: int = 3
     steps_per_call: int = 1
     seed: int = 0
