@@ -79,7 +79,7 @@ def test_reference_rows_on_every_12th_item_are_those_of_others():
     assert measured["fgr"]["mae_rotation"] == pytest.approx(0.233, abs=0.005)
 
 
-@pytest.mark.parametrize("name", ["benchmarks/speed.md", "summary.md", "trials/table.md"])
+@pytest.mark.parametrize("name", ["benchmarks/speed.md", "summary.md", "trials/table.md", "ablation/table.md"])
 def test_readme_shows_the_tables_that_were_written(name):
     for table in (EXPERIMENTS / name).read_text().strip().split("\n\n"):
         assert table in README
@@ -102,6 +102,17 @@ def test_regions_are_used_and_the_same_in_both_clouds():
     assert numbers["regions with more than 1 % of all points"] >= 5
     shares = [f"{100 * numbers[f'consistency {when}']:.0f} %" for when in ("in the last step", "before alignment")]
     assert "{} have the same region once the clouds are nearly aligned, {}\n  before".format(*shares) in README
+
+
+@pytest.mark.parametrize("name", available_models())
+def test_card_tells_what_the_tables_measured_and_the_limits(name):
+    card, suffix = model_card(name), "" if name == "modelnet40" else f":{name}"
+    assert card["licence"] and card["limits"] and card["measured"]
+    for entry in card["measured"]:
+        parts = [part for part in load(entry["table"])["parts"] if part["protocol"] == entry["protocol"]]
+        same = [part for part in parts if (part["data"], part["items"]) == (entry["data"], entry["items"])]
+        found = [row for part in same for row in part["rows"] if row["method"] == entry["method"] + suffix]
+        assert any(row["mae_rotation"] == pytest.approx(entry["mae_rotation"], rel=1e-4) for row in found)
 
 
 @pytest.mark.parametrize("name", available_models())
