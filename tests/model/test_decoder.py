@@ -15,7 +15,6 @@ from urrt_jax.geometry.clouds import make_cloud, normalize_pair
 from urrt_jax.model import estimate, init_model
 from urrt_jax.model.decoder import fusion_weights
 from urrt_jax.model.landmarks import (
-    align_landmarks,
     landmark_decoders,
     place_landmarks,
     point_queries,
@@ -142,65 +141,6 @@ def test_landmarks_of_equal_surroundings_are_matched_from_any_pose(small_config,
     )
     found = _estimate(model, source, target).transform
     assert float(jnp.rad2deg(rigid.rotation_angle(found.rotation, jnp.asarray(turn, jnp.float32)))) < 2
-
-
-def _landmarks(seed: int = 0) -> jnp.ndarray:
-    return jnp.asarray(np.random.default_rng(seed).normal(size=(20, 3)), jnp.float32)
-
-
-def _weights() -> jnp.ndarray:
-    return jnp.asarray(np.random.default_rng(9).uniform(0.2, 1, 20), jnp.float32)
-
-
-@pytest.mark.parametrize("rounds", [0, 3])
-def test_matching_landmarks_give_their_motion(pose, rounds):
-    source = _landmarks()
-    found = align_landmarks(source, source @ pose[0].T + pose[1], _weights(), rounds=rounds)
-    _close(found, rigid.Rigid(pose[0], pose[1]), atol=1e-3)
-
-
-@pytest.mark.parametrize("rounds", [0, 3])
-def test_landmarks_without_weight_do_not_count(pose, rounds):
-    source, weights = _landmarks(), _weights().at[3].set(0.0)
-    target = source @ pose[0].T + pose[1]
-    found = align_landmarks(source, target.at[3].add(7.0), weights, rounds=rounds)
-    _close(found, align_landmarks(source, target, weights, rounds=rounds))
-
-
-def test_landmarks_that_disagree_lose_their_weight(pose):
-    source = _landmarks()
-    target = (source @ pose[0].T + pose[1]).at[:6].set(_landmarks(5)[:6])
-    truth = jnp.asarray(pose[0], jnp.float32)
-    errors = [
-        float(rigid.rotation_angle(align_landmarks(source, target, _weights(), rounds=k).rotation, truth))
-        for k in (0, 3, 8)
-    ]
-    assert errors[0] > 0.1
-    assert errors[1] < 0.3 * errors[0]
-    assert errors[2] < 2e-3
-
-
-def test_noise_leaves_the_weight_to_many_landmarks(pose):
-    """Weights that multiply over the rounds end with three landmarks, and with many times the error."""
-    truth, errors = jnp.asarray(pose[0], jnp.float32), []
-    for seed in range(10):
-        source = _landmarks(seed)
-        target = source @ pose[0].T + pose[1] + 0.05 * _landmarks(seed + 100)
-        found = [align_landmarks(source, target, _weights(), rounds=k).rotation for k in (0, 40)]
-        errors.append([float(rigid.rotation_angle(rotation, truth)) for rotation in found])
-    plain, agreed = np.mean(errors, axis=0)
-    assert agreed < 3 * plain
-
-
-def test_landmarks_in_one_place_turn_nothing():
-    """Rounding alone would otherwise choose the rotation."""
-    source, target = (jnp.ones((20, 3)) + 1e-6 * _landmarks(k) for k in (1, 2))
-    _close(align_landmarks(source, target, _weights(), rounds=3).rotation, jnp.eye(3), atol=1e-5)
-
-
-def test_landmarks_that_weigh_nothing_move_nothing():
-    found = align_landmarks(_landmarks(1), _landmarks(2), jnp.zeros(20), rounds=3)
-    _close(found, rigid.identity())
 
 
 def test_untrained_pose_decoders_hardly_move_anything(small_config, turned):

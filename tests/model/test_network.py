@@ -411,6 +411,7 @@ def test_shape_embedding_of_an_empty_cloud_is_zero():
         ({"octaves": -1}, "^octaves: .*-1"),
         ({"lookups": -1}, "^lookups: .*-1"),
         ({"consensus": -1}, "^consensus: .*-1"),
+        ({"hypotheses": -1}, "^hypotheses: .*-1"),
         ({"key_width": 1.5}, "^key_width: .*1.5"),
         ({"regions": 0}, "^regions: .*0"),
         ({"width": -1}, "^width: .*-1"),

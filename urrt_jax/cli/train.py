@@ -34,6 +34,7 @@ class NetworkFlags:
         octaves: Widths at which the surroundings of points are described; 0: not at all.
         lookups: Points of each cloud that are looked up in both; 0: none.
         consensus: Rounds in which landmarks that disagree with the others lose weight.
+        hypotheses: Of the pose, the best of which these rounds start from; 0: from none. Not in training.
         steps: How often the network is applied, each time to the source as moved so far.
         points: Points of a cloud that the network looks at.
     """
@@ -48,6 +49,7 @@ class NetworkFlags:
     octaves: int = 4
     lookups: int = 256
     consensus: int = 12
+    hypotheses: int = 0
     steps: int = 3
     points: int = 512
 

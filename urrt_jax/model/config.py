@@ -29,6 +29,7 @@ class ModelConfig:
       octaves: widths at which the points' surroundings are described (``features/moments.py``); 0: not at all.
       lookups: points of each cloud that are looked up in both, for landmarks too.
       consensus: rounds in which landmarks that disagree with the others are weighed down.
+      hypotheses: of the pose, the best of which the first of these rounds starts from; 0: from none.
       steps: K, how often the network is applied, each time to the source moved by the estimate so far.
       points: points of a cloud that the network looks at; larger clouds are subsampled (``subsample``).
     """
@@ -48,6 +49,7 @@ class ModelConfig:
     octaves: int = 4
     lookups: int = 256
     consensus: int = 12
+    hypotheses: int = 0
     steps: int = 3
     points: int = 512
 
@@ -58,7 +60,7 @@ class ModelConfig:
             raise ValueError(f"decoder: expected 'landmarks' or 'pose', got {self.decoder!r}")
         check_whole(self, regions=1, width=1, branch_width=1, attention_layers=0, landmarks=1, key_width=1)
         check_positive(self, "sharpness")
-        check_whole(self, octaves=0, lookups=0, consensus=0, steps=1, points=3)
+        check_whole(self, octaves=0, lookups=0, consensus=0, hypotheses=0, steps=1, points=3)
         for name in ("encoder_widths", "position_widths", "decoder_widths"):
             widths = getattr(self, name)
             object.__setattr__(self, name, tuple(widths))

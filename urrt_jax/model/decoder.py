@@ -1,7 +1,8 @@
 """Region-aware decoding: from the encodings of both clouds to one transform.
 
 Decoder g_k reads what region k knows of both clouds and gives its share of the answer; the shares are fused by how many
-points the region holds. What a share is, is the configuration's: landmarks (``landmarks.py``) or a pose (``pose.py``).
+points the region holds. What a share is, is the configuration's: landmarks (``landmarks.py``), aligned where they agree
+(``consensus.py``), or a pose (``pose.py``).
 """
 
 import jax
@@ -11,10 +12,10 @@ from jax import Array
 from urrt_jax.features.moments import invariant_count
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.config import ModelConfig
+from urrt_jax.model.consensus import align_landmarks, even_seeds
 from urrt_jax.model.encoding import Encoding
 from urrt_jax.model.landmarks import (
     Queries,
-    align_landmarks,
     key_size,
     landmark_decoders,
     place_keys,
@@ -52,13 +53,17 @@ def decode(config: ModelConfig, params: dict, source: Encoding, target: Encoding
     if config.decoder == "pose":
         return fuse_poses(decode_poses(config, params, *features), weights)
     queries = region_queries(config, params["landmarks"], *features, weights)
+    groups = [len(queries.weights)]
     if config.lookups:
         some = [_some_points(encoding, config.lookups) for encoding in (source, target)]
+        groups += [len(keys) for keys, _ in some]
         asked = point_queries(config, params["trust"], *map(jnp.concatenate, zip(*some, strict=True)))
         queries = Queries(*(jnp.concatenate(both) for both in zip(queries, asked, strict=True)))
     places = place_landmarks(config.sharpness * queries.source, source.keys, source.cloud)
     others = place_landmarks(config.sharpness * queries.target, target.keys, target.cloud)
-    return align_landmarks(places, others, queries.weights, rounds=config.consensus)
+    # As many of either cloud's points, so that swapped clouds have the same ones.
+    seeds = even_seeds(groups, config.hypotheses)
+    return align_landmarks(places, others, queries.weights, rounds=config.consensus, seeds=seeds)
 
 
 def _some_points(encoding: Encoding, count: int) -> tuple[Array, Array]:

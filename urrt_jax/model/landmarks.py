@@ -6,9 +6,9 @@ Suwajanakorn et al. 2018, KeypointNet). A query says what is chosen; the points'
 * from decoder g_k, which reads the features of region k in both clouds and asks for C landmarks, or
 * from a point, whose own key is looked up in both clouds.
 
-Landmarks are weighed (the regions' as in eq. (3)), those that disagree with the others lose weight, and the rest are
-aligned in closed form. Two clouds that lie on each other have the same landmarks, so the aligned pose is an exact fixed
-point of every step, and swapped clouds give the inverse.
+Landmarks are weighed (the regions' as in eq. (3)), and those that agree are aligned (``consensus.py``). Two clouds that
+lie on each other have the same landmarks, so the aligned pose is an exact fixed point of every step, and swapped clouds
+give the inverse.
 """
 
 from typing import NamedTuple
@@ -18,15 +18,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.rigid import Rigid, procrustes
 from urrt_jax.model.blocks import Perceptron, region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
-
-# Lengths and areas in a frame of unit radius.
-_STIFFNESS = 1e-3  # far below the spread of landmarks that mean anything
-_TOLERANCE = 0.01  # landmarks this near to each other agree
 
 
 class Queries(NamedTuple):
@@ -133,23 +127,3 @@ def place_landmarks(queries: Array, keys: Array, cloud: Cloud) -> Array:
     summed = jnp.concatenate([cloud.points, jnp.ones_like(cloud.points[:, :1])], axis=1)
     places = jnp.matmul(shares, summed, precision=jax.lax.Precision.HIGHEST)
     return places[:, :3] / places[:, 3:]
-
-
-def align_landmarks(source: Array, target: Array, weights: Array, *, rounds: int) -> Rigid:
-    """φ: the transform that carries landmarks (M, 3) of the source onto those of the target, with weights (M,).
-
-    In every round, landmarks at distance r after the alignment are weighed down by (1 + r²/s²)⁻², Geman and McClure's
-    weight, where s² is the mean of r² under the weights of the round before: it shrinks as what disagrees grows light.
-    A round starts from the weights that were given. Were they to multiply, noise would leave a handful of landmarks.
-    """
-
-    def shares(values: Array) -> Array:
-        return values / jnp.maximum(jnp.sum(values), 1e-12)
-
-    def agreeing(share: Array, _: None) -> tuple[Array, None]:
-        found = procrustes(source, target, share, stiffness=_STIFFNESS)
-        square = jnp.sum((rigid.apply(found, source) - target) ** 2, axis=-1)
-        return shares(weights / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2), None
-
-    share, _ = jax.lax.scan(agreeing, shares(weights), None, length=rounds)
-    return procrustes(source, target, share, stiffness=_STIFFNESS)

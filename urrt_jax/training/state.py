@@ -67,9 +67,9 @@ class TrainConfig:
             raise ValueError(f"loss_points: {self.loss_points} exceeds the {self.pairs.points} points of a pair")
 
     def training_network(self) -> ModelConfig:
-        """The network as training runs it: with fewer steps and rounds, which are the same ones."""
+        """The network as training runs it: fewer steps and rounds, and no hypotheses; the parameters are the same."""
         steps, rounds = min(self.unrolled, self.model.steps), min(self.rounds, self.model.consensus)
-        return dataclasses.replace(self.model, steps=steps, consensus=rounds)
+        return dataclasses.replace(self.model, steps=steps, consensus=rounds, hypotheses=0)
 
 
 @jax.tree_util.register_dataclass
