@@ -75,6 +75,7 @@ def small_config() -> ModelConfig:
         octaves=4,
         lookups=16,
         consensus=3,
+        hypotheses=8,
         steps=2,
         points=64,
     )

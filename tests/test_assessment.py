@@ -108,9 +108,75 @@ def test_confidence_in_a_cloud_turned_about_its_centre_is_low(make_cloud_points,
     assert float(_fit(_padded(points), _padded(points), wrong).confidence) < 0.1
 
 
+def _tripod(seed: int) -> np.ndarray:
+    """400 points of three arms of different lengths along the axes: turned by no angle it is itself."""
+    draw = np.random.default_rng(seed)
+    along = draw.uniform(size=400) * np.repeat([1.0, 0.7, 0.4], [200, 120, 80])
+    points = draw.normal(scale=0.03, size=(400, 3))
+    points[np.arange(400), np.repeat([0, 1, 2], [200, 120, 80])] += along
+    return points
+
+
+def _about(points: np.ndarray, axis: np.ndarray, degrees: float) -> Rigid:
+    """The turn about an axis through the points' centre."""
+    turn, centre = Rotation.from_rotvec(degrees * axis, degrees=True).as_matrix(), points.mean(axis=0)
+    return Rigid(jnp.asarray(turn, jnp.float32), jnp.asarray(centre - turn @ centre, jnp.float32))
+
+
+def test_a_right_pose_of_an_uneven_shape_is_unique_and_its_turns_are_the_reverse():
+    points = _tripod(0)
+    cloud, other = _padded(points), _padded(_tripod(1))
+    assert float(_fit(cloud, other, rigid.identity()).uniqueness) > 0.2
+    axes = np.linalg.eigh(np.cov(points.T))[1].T
+    for axis in axes:
+        for degrees in (-90, 90, 180):
+            assert float(_fit(cloud, cloud, _about(points, axis, degrees)).uniqueness) < -0.2
+
+
+def _box(seed: int, sides: tuple[float, float, float]) -> np.ndarray:
+    """600 points of its faces."""
+    draw, rows = np.random.default_rng(seed), np.arange(600)
+    points = draw.uniform(size=(600, 3))
+    points[rows, rows % 3] = draw.integers(2, size=600)
+    return points * sides
+
+
+@pytest.mark.parametrize("sides", [(1, 1, 2), (1, 1.5, 2)])
+def test_a_box_is_itself_when_turned(sides):
+    """So that its pose is not unique, however well it fits, and not as sure as that of an uneven shape."""
+    found = _fit(_padded(_box(0, sides)), _padded(_box(1, sides)), rigid.identity())
+    assert abs(float(found.uniqueness)) < 0.1
+    uneven = _fit(_padded(_tripod(0)), _padded(_tripod(1)), rigid.identity())
+    assert float(found.confidence) < float(uneven.confidence)
+
+
+def test_uniqueness_is_that_of_swapped_and_of_moved_clouds(cloud):
+    source, target, transform = _padded(cloud), _padded(cloud + np.float32(0.02)), _turn(5)
+    expected = float(_fit(source, target, transform).uniqueness)
+    swapped = _fit(target, source, rigid.inverse(transform)).uniqueness
+    assert float(swapped) == pytest.approx(expected, abs=1e-3)
+    motion = Rigid(_turn(70).rotation, jnp.array([0.1, -0.3, 0.2]))
+    moved = target._replace(points=rigid.apply(motion, target.points))
+    both = _fit(source, moved, rigid.compose(motion, transform)).uniqueness
+    assert float(both) == pytest.approx(expected, abs=0.02)  # thinned along another curve
+
+
+@pytest.mark.parametrize("shape", ["point", "line", "empty", "ball"])
+def test_uniqueness_of_what_has_no_axes_is_finite(shape):
+    points = {
+        "point": np.ones((50, 3)),
+        "line": np.linspace(0, 1, 50)[:, None] * [1.0, 2.0, 3.0],
+        "empty": np.zeros((0, 3)),
+        "ball": np.random.default_rng(0).normal(size=(50, 3)),
+    }[shape]
+    assert -1 <= float(_fit(_padded(points), _padded(points), rigid.identity()).uniqueness) <= 1
+
+
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_confidence_is_a_probability_where_nothing_and_where_all_is_near(share):
-    confidence = float(Fit(jnp.zeros(1), jnp.zeros(1, int), jnp.ones(()), jnp.full((2, 3), share)).confidence)
+    confidence = float(
+        Fit(jnp.zeros(1), jnp.zeros(1, int), jnp.ones(()), jnp.full((2, 3), share), jnp.array(share)).confidence
+    )
     assert (0 <= confidence < 1e-3) if share == 0 else (0.99 < confidence <= 1)
 
 

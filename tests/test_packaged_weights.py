@@ -34,8 +34,8 @@ def test_command_of_the_card_trains_what_the_card_says(name):
     card, model = urrt_jax.model_card(name), urrt_jax.load_model(name)
     config = tyro.cli(Train, args=shlex.split(card["command"])[2:]).config()
     assert json.loads(json.dumps(dataclasses.asdict(config))) == card["training"]
-    # How often the network runs, and how it comes to a consensus, can be chosen again after training.
-    used = {name: getattr(model.config, name) for name in ("steps", "consensus", "hypotheses")}
+    # How often the network runs, what it looks up, and how it comes to a consensus, can be chosen again after training.
+    used = {name: getattr(model.config, name) for name in ("steps", "lookups", "consensus", "hypotheses")}
     assert dataclasses.replace(config.model, **used) == model.config
 
 

@@ -10,18 +10,23 @@ from jax.core import Tracer
 
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.neighbors import nearest
+from urrt_jax.geometry.neighbors import nearest, spacing
+from urrt_jax.geometry.normals import least_axis
 from urrt_jax.geometry.prepared import Prepared, prepare
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.geometry.rigid import Rigid, nearest_rotation
 
+_HIGHEST = jax.lax.Precision.HIGHEST
 _RINGS = (1.0, 1.5, 3.0)  # spacings of the coarser cloud: close, touching (samples of one surface do), and about
 _CLOSE, _TOUCHING, _ABOUT = range(3)
 _ASKED = 4096  # points of a large target
-ASSESSED = {"overlap": 4.1, "tightness": 7.7, "closeness": 9.2}
+_TURNED, _TURNED_ASKED = 512, 128  # points of a cloud that is turned, and of those that ask
+_QUARTER = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+_TURNS = np.array([np.linalg.matrix_power(np.roll(_QUARTER, (k, k), (0, 1)), n) for k in range(3) for n in (1, 2, 3)])
+ASSESSED = {"overlap": 3.0, "tightness": 4.0, "closeness": 4.2, "uniqueness": 8.3}
 """What confidence is made of, and the weights: a logistic regression on training shapes.
 
-``experiments/confidence`` fits it again, to another draw of them, and measures these."""
-BIAS = -16.1
+``experiments/confidence`` fits it again and measures these on test shapes and scans."""
+BIAS = -9.5
 
 
 class Fit(NamedTuple):
@@ -32,12 +37,14 @@ class Fit(NamedTuple):
       nearest: (N,) int32, that point's row.
       touching: (), the distance within which points touch: 1.5 spacings of the coarser cloud.
       shares: (2, 3), of the source's points and of the target's: how many lie within 1, 1.5 and 3 spacings.
+      uniqueness: (), from -1 to 1: how much more of both clouds agrees than after the best of some turns.
     """
 
     squared: Array
     nearest: Array
     touching: Array
     shares: Array
+    uniqueness: Array
 
     @property
     def overlap(self) -> Array:
@@ -46,17 +53,18 @@ class Fit(NamedTuple):
 
     @property
     def evidence(self) -> Array:
-        """(3,), each from 0 to 1, in the order of ``ASSESSED``: what surfaces do that lie on each other.
+        """(4,), in the order of ``ASSESSED``: what surfaces do that lie on each other, and in no other way.
 
-        The larger overlap; the share of the points that come near which touch; the share of those which are close.
+        The larger overlap; the share of the points that come near which touch; the share of those which are close; the
+        uniqueness.
         """
         close, touching, about = jnp.sum(self.shares, axis=0)
         tightness, closeness = touching / jnp.maximum(about, 1e-3), close / jnp.maximum(touching, 1e-3)
-        return jnp.stack([jnp.max(self.overlap), tightness, closeness])
+        return jnp.stack([jnp.max(self.overlap), tightness, closeness, self.uniqueness])
 
     @property
     def confidence(self) -> Array:
-        """(), from 0 to 1: how sure it is that surfaces lie on each other rather than cross."""
+        """(), from 0 to 1: how sure it is that surfaces lie on each other rather than cross, and in this pose alone."""
         return jax.nn.sigmoid(BIAS + self.evidence @ jnp.array(list(ASSESSED.values())))
 
 
@@ -73,7 +81,59 @@ def fit(source: Cloud | Prepared, target: Cloud | Prepared, transform: Rigid) ->
         jax.vmap(lambda ring, mask=mask, squared=squared: inlier_share(mask, squared, ring)[0])(rings)
         for mask, squared in ((mask, squared), (some.mask, back))
     ]
-    return Fit(jnp.where(mask, squared, jnp.inf), index, _RINGS[_TOUCHING] * width, jnp.stack(shares))
+    far = jnp.where(mask, squared, jnp.inf)
+    return Fit(far, index, _RINGS[_TOUCHING] * width, jnp.stack(shares), _uniqueness(source, target, transform))
+
+
+def _uniqueness(source: Prepared, target: Prepared, transform: Rigid) -> Array:
+    """By how much the agreement after ``transform`` exceeds that after further turns, (), from -1 to 1.
+
+    Shapes are mistaken for themselves turned by a half or a quarter, about an axis of symmetry or nearly so, which is a
+    principal one: the nine such turns about the principal axes of both clouds together, through their centre.
+    """
+    source, target, transform = jax.tree.map(jax.lax.stop_gradient, (source, target, transform))
+    clouds = source.thin(_TURNED), target.thin(_TURNED)
+    asked = source.thin(_TURNED_ASKED), target.thin(_TURNED_ASKED)
+    moved = clouds[0]._replace(points=rigid.apply(transform, clouds[0].points))
+    together = Cloud(*(jnp.concatenate(both) for both in zip(moved, clouds[1], strict=True)))
+    share = together.mask / jnp.maximum(jnp.sum(together.mask), 1)
+    centre = jnp.matmul(share, together.points, precision=_HIGHEST)
+    centred = jnp.where(together.mask[:, None], together.points - centre, 0.0)
+    axes = _principal_axes(jnp.matmul(centred.T, centred, precision=_HIGHEST))
+
+    turned = jnp.matmul(axes, jnp.matmul(_TURNS, axes.T, precision=_HIGHEST), precision=_HIGHEST)
+    rotations = jnp.concatenate([jnp.eye(3)[None], turned])
+    turns = Rigid(rotations, centre - rigid.rotate(rotations, centre))
+    reach = jnp.maximum(jnp.maximum(*map(spacing, clouds)), 1e-6)  # points may all coincide
+    agreements = jax.vmap(lambda turn: agreement(rigid.compose(turn, transform), clouds, asked, reach))(turns)
+    return agreements[0] - jnp.max(agreements[1:])
+
+
+def _principal_axes(moment: Array) -> Array:
+    """Principal axes of a symmetric matrix (3, 3), the columns of a rotation; any where it has none."""
+    least, greatest = least_axis(moment), least_axis(jnp.trace(moment) * jnp.eye(3) - moment)
+    return nearest_rotation(jnp.stack([greatest, jnp.cross(least, greatest), least], axis=1))
+
+
+def agreement(transform: Rigid, clouds: tuple[Cloud, Cloud], asked: tuple[Cloud, Cloud], reach: Array) -> Array:
+    """How well two clouds lie on each other, (): the mean over both directions of max(0, 1 − d²/r²), in [0, 1].
+
+    Args:
+      transform: source to target.
+      clouds: source and target.
+      asked: some of their points, whose distances d to the other cloud are counted.
+      reach: r, ().
+    """
+
+    def share(points: Array, mask: Array, other: Cloud) -> Array:
+        squared = nearest(points, other).squared
+        closeness = jnp.where(mask & jnp.isfinite(squared), jnp.maximum(1 - squared / reach**2, 0.0), 0.0)
+        return jnp.sum(closeness) / jnp.maximum(jnp.sum(mask), 1)
+
+    (source, target), (ask_source, ask_target) = clouds, asked
+    forth = share(rigid.apply(transform, ask_source.points), ask_source.mask, target)
+    back = share(rigid.apply(rigid.inverse(transform), ask_target.points), ask_target.mask, source)
+    return (forth + back) / 2
 
 
 def inlier_share(mask: Array, squared: Array, reach: Array) -> tuple[Array, Array]:
@@ -94,7 +154,7 @@ def information(points: Array, inlier: Array) -> Array:
     points = jnp.where(inlier[:, None], points, 0.0)
     count = jnp.sum(inlier).astype(points.dtype)
     total = jnp.sum(points, axis=0)
-    second = jnp.matmul(points.T, points, precision=jax.lax.Precision.HIGHEST)
+    second = jnp.matmul(points.T, points, precision=_HIGHEST)
     turning = jnp.trace(second) * jnp.eye(3) - second
     return jnp.block([[count * jnp.eye(3), -cross_matrix(total)], [cross_matrix(total), turning]])
 
@@ -117,7 +177,7 @@ def well_posed(cloud: Cloud) -> Array:
     """Whether a centred cloud determines a rotation, (): at least three points, not all on one line."""
     points = jax.lax.stop_gradient(cloud.points)
     # Rounding alone gives points on a line a second moment of about 1e-7 of the first.
-    moments = jnp.matmul(points.T, points, precision=jax.lax.Precision.HIGHEST)
+    moments = jnp.matmul(points.T, points, precision=_HIGHEST)
     # On a line all but one eigenvalue vanish, and with them the sum of their products, the second invariant. (LAPACK's
     # batched eigenvalues of two clouds may wait for each other for ever on a CPU.)
     trace = jnp.trace(moments)

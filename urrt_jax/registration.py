@@ -50,8 +50,8 @@ class Registration:
       overlap: (2,), the share of the source's points that lie within 1.5 spacings (the coarser cloud's) of the target,
         and of the target's (up to 4096 of them) that lie as near the source.
       confidence: (), from 0 to 1: how sure it is that the surfaces lie on each other rather than cross, by their
-        overlap and by how many of the points that come near touch; learned on training shapes. It cannot exclude a
-        wrong pose of a shape that is nearly symmetric.
+        overlap and by how many of the points that come near touch, and that they do so in no other pose, by how much
+        less they agree after quarter and half turns; learned on training shapes. Low for symmetric ones.
       converged: (), bool: the input was finite and not collinear, refinement settled within its iterations (where
         there was refinement), and the confidence is at least 0.5.
       correspondences: (N,) int32, the row of the target's point nearest to every source point, -1 where none lies

@@ -45,7 +45,14 @@ def configured(variant: Variant, decoder: Decoder, seed: int, steps: int) -> Tra
     landmarks = 64 if variant == "A" else 8
     return TrainConfig(
         model=ModelConfig(
-            variant=variant, decoder=decoder, landmarks=landmarks, lookups=0, consensus=3, steps=1, points=512
+            variant=variant,
+            decoder=decoder,
+            landmarks=landmarks,
+            lookups=0,
+            consensus=3,
+            hypotheses=0,
+            steps=1,
+            points=512,
         ),
         pairs=PairConfig(corrupted=0.0, signed=0.0, both_ways=0.0),
         steps=steps,

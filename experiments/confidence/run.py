@@ -1,14 +1,14 @@
-"""How well `Registration.confidence` tells right poses from wrong ones, and how its four numbers are fitted.
+"""How well `Registration.confidence` tells right poses from wrong ones, and how its five numbers are fitted.
 
     python experiments/confidence/run.py --data PATH [--fit]
 
 The numbers are a logistic regression on training shapes: pairs of the hard protocols as they are, the same pairs turned
-by any rotation (which the network mostly misses), and searched ones. The packaged ones were fitted to an earlier draw
-of such pairs, by an earlier network; "regression" in the results is this run's, and "left out" says which of the two to
-prefer: the mean log loss on each protocol, of a regression on the others, and of the packaged numbers. With --fit only
-these are found, and printed. The curves are of test shapes and real scans that no number was fitted to. A pose is right
-within 5° and 0.1 (scans: 0.05 diagonals), which for axisymmetric shapes is not decided by what can be seen: the curve
-without these stands beside that of all. Writes results.json, table.md and roc.png beside this file.
+by any rotation (half of which the network misses), and searched ones. "regression" in the results is this run's, as the
+packaged ones were once; "left out" says which of the two to prefer: the mean log loss on each protocol, of a regression
+on the others, and of the packaged numbers. With --fit only these are found, and printed. The curves are of test shapes
+and real scans that no number was fitted to. A pose is right within 5° and 0.1 (scans: 0.05 diagonals), which for
+axisymmetric shapes is not decided by what can be seen: the curve without these stands beside that of all. Writes
+results.json, table.md and roc.png beside this file.
 """
 
 import argparse
@@ -44,7 +44,7 @@ BLOCK = 16_384
 
 
 class Answers(NamedTuple):
-    """Of B pairs: whether the pose is right, what it was told by (B, 3), the confidence, and whether turns are seen."""
+    """Of B pairs: whether the pose is right, what it was told by (B, 4), the confidence, and whether turns are seen."""
 
     right: np.ndarray
     told_by: np.ndarray

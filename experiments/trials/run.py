@@ -2,7 +2,7 @@
 
     python experiments/trials/run.py --data PATH [--only NAME ...]
 
-Every trial trains one configuration with one change, for 600 steps of the usual mixture, and is measured on the
+Every trial trains one configuration with one change, for 300 steps of the usual mixture, and is measured on the
 protocols of the tables, network alone, with every second shape held out of the training split; no test shape is looked
 at. A trial takes some five minutes of two cores. Runs are kept in runs/ beside this file: an interrupted
 command continues where it stopped. Writes results.json and table.md beside this file, with the trials that are there.
@@ -34,7 +34,7 @@ PROTOCOLS = {
     "outliers": "D.O.",
     "independent_noise": "independent + noise",
 }
-BASE = TrainConfig(pairs=PairConfig(ramp_share=0.2), steps=600, learning_rate=1.5e-3, steps_per_call=10)
+BASE = TrainConfig(pairs=PairConfig(ramp_share=0.2), steps=300, learning_rate=1.5e-3, steps_per_call=10)
 TRIALS: dict[str, dict[str, Any]] = {
     "base: surroundings, look-ups, consensus": {},
     "landmarks of regions alone": {"model": {"sharpness": 1.0, "octaves": 0, "lookups": 0, "consensus": 0}},
@@ -44,11 +44,14 @@ TRIALS: dict[str, dict[str, Any]] = {
     "no look-ups": {"model": {"lookups": 0}},
     "64 look-ups": {"model": {"lookups": 64}},
     "128 look-ups": {"model": {"lookups": 128}},
-    "512 look-ups": {"model": {"lookups": 512}},
+    "256 look-ups": {"model": {"lookups": 256}},
+    "512 look-ups in training": {"lookups": 512},
     "sharpness 1": {"model": {"sharpness": 1.0}},
     "no consensus": {"model": {"consensus": 0}},
     "4 rounds of consensus in use": {"model": {"consensus": 4}},
     "24 rounds of consensus in use": {"model": {"consensus": 24}},
+    "no hypotheses in use": {"model": {"hypotheses": 0}},
+    "256 hypotheses in use": {"model": {"hypotheses": 256}},
     "no rounds of consensus in training": {"rounds": 0},
     "12 rounds of consensus in training": {"rounds": 12},
     "decoders that regress the pose": {"model": {"decoder": "pose"}},
@@ -75,9 +78,11 @@ TRIALS: dict[str, dict[str, Any]] = {
     "Chamfer scale 0.3": {"chamfer_scale": 0.3},
     "learning rate 7.5e-4": {"learning_rate": 7.5e-4},
     "learning rate 3e-3": {"learning_rate": 3e-3},
-    "batches of 16, twice the steps": {"batch": 16, "steps": 1200},
-    "batches of 64, half the steps": {"batch": 64, "steps": 300},
+    "batches of 16, twice the steps": {"batch": 16, "steps": 600},
+    "batches of 64, half the steps": {"batch": 64, "steps": 150},
     "first third clean": {"pairs": {"clean_share": 0.33}},
+    "half of the clouds cropped": {"pairs": {"cropped": 0.5}},
+    "crops of up to a quarter": {"pairs": {"keep": 0.75}},
     "no signed angles": {"pairs": {"signed": 0.0}},
 }
 

@@ -9,9 +9,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from urrt_jax.geometry import rigid
-from urrt_jax.geometry.rigid import Rigid, nearest_rotation, procrustes, rotation_angle, rotation_from_6d
+from urrt_jax.geometry.rigid import (
+    Rigid,
+    nearest_rotation,
+    procrustes,
+    quick_rotation,
+    rotation_angle,
+    rotation_from_6d,
+)
 
-_polar = jax.jit(nearest_rotation)
+_polar, _quick = jax.jit(nearest_rotation), jax.jit(quick_rotation)
 _from_6d = jax.jit(rotation_from_6d)
 _angle = jax.jit(rotation_angle)
 _compose, _inverse, _apply = jax.jit(rigid.compose), jax.jit(rigid.inverse), jax.jit(rigid.apply)
@@ -146,6 +153,19 @@ def test_nearest_rotation_is_a_rotation_for_a_degenerate_moment(name):
 def test_nearest_rotation_has_a_finite_derivative_for_a_degenerate_moment(name):
     jacobian = jax.jacrev(nearest_rotation)(jnp.asarray(_DEGENERATE[name], jnp.float32))
     assert bool(jnp.all(jnp.isfinite(jacobian)))
+
+
+@given(_seeds, st.sampled_from([1e-6, 1.0, 1e6]), st.sampled_from([-1.0, 0.0, 1.0]))
+def test_quick_rotation_is_the_nearest_one_where_that_is_clear(seed, size, last):
+    """Whatever the size of the moment; flat and mirrored ones, too."""
+    first, second = _random(seed, 3.0).rotation, _random(seed + 1, 3.0).rotation
+    moment = np.float32(size) * np.asarray(first) @ np.diag([1.0, 0.7, 0.4 * last]).astype(np.float32) @ second
+    np.testing.assert_allclose(_quick(moment), _polar(moment), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", _DEGENERATE)
+def test_quick_rotation_is_a_rotation_for_a_degenerate_moment(name):
+    _is_rotation(_quick(_DEGENERATE[name].astype(np.float32)))
 
 
 @given(st.lists(st.floats(-100, 100, width=32), min_size=6, max_size=6))

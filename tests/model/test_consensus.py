@@ -116,6 +116,15 @@ def test_hypotheses_find_the_few_that_agree_exactly(pose):
     assert max(with_hypotheses) < 0.5
 
 
+def test_a_hypothesis_that_hardly_anything_speaks_for_is_one():
+    """Weights are shares of what counts, however little that is."""
+    source, target, weights = _mistaken((np.eye(3), np.zeros(3)), 1)
+    turn = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix()
+    for size in (1.0, 1e-12):
+        found = _align(source, target @ turn.T, size * weights, rounds=12, hypotheses=64)
+        assert _error(found, (turn, np.zeros(3))) < 0.5
+
+
 def test_hypotheses_do_not_replace_what_is_given_where_nothing_is_misplaced(pose):
     """The given weights are one of the hypotheses, and the end of the rounds is the same."""
     landmarks = _misplaced(pose, 0, 0.0)

@@ -184,7 +184,7 @@ def test_gradient_in_the_parameters_agrees_with_finite_differences(model, pair, 
         answer = predict(Model(one_step, model.params | moved), *map(make_cloud, pair))
         return jnp.sum(answer.rotation * jnp.arange(9.0).reshape(3, 3)) + jnp.sum(answer.translation)
 
-    step = 1e-6
+    step = 1e-7  # consensus bends what it gives: at 1e-6 differences are off by a thousandth
     difference = float(total(step) - total(-step)) / (2 * step)
     assert float(jax.grad(total)(0.0)) == pytest.approx(difference, rel=1e-4, abs=1e-6)
 

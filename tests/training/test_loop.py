@@ -141,12 +141,12 @@ def test_steps_per_call_do_not_change_the_parameters(arrays):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), together.params, alone.params)
 
 
-def test_only_the_asked_steps_and_rounds_are_trained(arrays):
-    """A network of three steps and eight rounds, of which one and none are trained, learns as one of those does."""
+def test_training_does_no_more_than_it_is_asked_for(arrays):
+    """A network that does more in use learns as one does that never does more."""
     few = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=1, consensus=0))
-    many = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=3, consensus=8))
+    many = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=3, lookups=16, consensus=8))
     first, _ = train_steps(_fresh(few), arrays, few)
-    second, _ = train_steps(_fresh(many), arrays, dataclasses.replace(many, unrolled=1, rounds=0))
+    second, _ = train_steps(_fresh(many), arrays, dataclasses.replace(many, unrolled=1, lookups=8, rounds=0))
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
 
 
@@ -284,6 +284,7 @@ def test_interval_that_does_not_fit_the_steps_per_call_is_named(shapes, tmp_path
         ({"warmup": -1}, "^warmup: .*-1"),
         ({"unrolled": 0}, "^unrolled: .*0"),
         ({"rounds": -1}, "^rounds: .*-1"),
+        ({"lookups": -1}, "^lookups: .*-1"),
         ({"steps": 10, "steps_per_call": 3}, "^steps_per_call: 3 does not divide steps, 10"),
         ({"loss_points": 2000}, "^loss_points: 2000 exceeds"),
     ],

@@ -179,6 +179,15 @@ def test_crop_keeps_the_share_asked_for(cloud, keep):
     assert np.abs(np.asarray(counts) - keep * 200).max() <= 1
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_share_of_cropped_clouds_is_the_one_asked_for(shapes, share):
+    config = dataclasses.replace(_CONFIG, noise=0.0, outliers=0.0, cropped=share)
+    batch = _batch(_KEYS[4], shapes, config, 64, 1.0)
+    # Half of the pairs have half of the points in each cloud to begin with.
+    left = np.stack([cloud.mask.sum(axis=1) for cloud in (batch.source, batch.target)])
+    assert np.mean(~np.isin(left, [32, 64])) == pytest.approx(share, abs=0.15)
+
+
 def test_crop_of_a_padded_cloud_keeps_a_share_of_its_real_points(cloud):
     mask = np.arange(200) < 100
     cropped = crop(_KEYS[0], make_cloud(cloud, mask), jnp.float32(0.5))

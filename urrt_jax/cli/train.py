@@ -47,9 +47,9 @@ class NetworkFlags:
     landmarks: int = 8
     sharpness: float = 4.0
     octaves: int = 4
-    lookups: int = 256
+    lookups: int = 512
     consensus: int = 12
-    hypotheses: int = 0
+    hypotheses: int = 64
     steps: int = 3
     points: int = 512
 
@@ -68,6 +68,7 @@ class PairFlags:
         ramp_share: Share of the steps in which spoiled pairs come in.
         corrupted: Share of pairs that are spoiled after that.
         noise: Largest standard deviation of the noise on every coordinate.
+        cropped: Share of the clouds of spoiled pairs that are cropped, each for itself.
         keep: Smallest share of a cloud that a crop leaves.
         outliers: Largest share of points replaced by stray ones.
     """
@@ -81,7 +82,8 @@ class PairFlags:
     ramp_share: float = 0.1
     corrupted: float = 0.75
     noise: float = 0.02
-    keep: float = 0.6
+    cropped: float = 0.75
+    keep: float = 0.5
     outliers: float = 0.2
 
 
@@ -108,6 +110,7 @@ class Train:
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
         unrolled: Of the network's steps, so many are trained; the later ones see what the last of these saw.
+        lookups: Points of each cloud that are looked up in training, at most the model's.
         rounds: Of consensus among landmarks in training, at most the model's; fresh landmarks have none to find.
         steps_per_call: Steps in one dispatch; more of them help on an accelerator.
         seed: Of the first weights and of every pair.
@@ -125,14 +128,15 @@ class Train:
     categories: int | None = None
     queries: int = 0
     validation_share: float = 0.05
-    steps: int = 5_000
+    steps: int = 8_000
     batch: int = 32
     learning_rate: float = 1e-3
     warmup: int = 200
     occupancy_weight: float = 0.02
     loss_points: int = 512
     unrolled: int = 2
-    rounds: int = 3
+    lookups: int = 256
+    rounds: int = 4
     steps_per_call: int = 1
     seed: int = 0
     every: int = 500

@@ -122,13 +122,45 @@ def _nearest_rotation_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tupl
 
 def _polar(moment: Array) -> tuple[Array, Array, Array]:
     """The rotation, the right singular vectors V and the signed stretches p of a 3×3 matrix; identity for NaN."""
-    moment = jnp.where(jnp.all(jnp.isfinite(moment)), moment, jnp.eye(3, dtype=moment.dtype))
-    left, stretch, right = jnp.linalg.svd(moment)
+    left, stretch, right = jnp.linalg.svd(_finite(moment))
     # Both factors are orthogonal, so the product of determinants is ±1; rounding it keeps the sign exact.
     sign = jnp.where(jnp.linalg.det(left) * jnp.linalg.det(right) < 0, -1.0, 1.0).astype(moment.dtype)
     signs = jnp.array([1.0, 1.0, 0.0], moment.dtype) + jnp.array([0.0, 0.0, 1.0], moment.dtype) * sign
     rotation = jnp.matmul(left * signs, right, precision=_HIGHEST)
     return rotation, right.T, stretch * signs
+
+
+def _finite(moment: Array) -> Array:
+    return jnp.where(jnp.all(jnp.isfinite(moment)), moment, jnp.eye(3, dtype=moment.dtype))
+
+
+def quick_rotation(moment: Array) -> Array:
+    """``nearest_rotation`` of a moment (3, 3), nearly, and several times faster under ``vmap``; without a derivative.
+
+    The unit quaternion of the rotation is the first eigenvector of a symmetric matrix (Horn 1987, section 4), found by
+    squaring that nine times. Components along eigenvectors whose values are nearly the first one's remain, so where the
+    moment hardly decides between two rotations, it is one between them.
+    """
+    moment = _finite(jax.lax.stop_gradient(moment))
+    moment = moment / jnp.maximum(jnp.max(jnp.abs(moment)), jnp.finfo(moment.dtype).tiny)
+    moment = moment / jnp.maximum(jnp.sqrt(jnp.sum(moment**2)), 1e-6)
+    trace, symmetric = jnp.trace(moment), moment + moment.T
+    turn = jnp.stack([moment[2, 1] - moment[1, 2], moment[0, 2] - moment[2, 0], moment[1, 0] - moment[0, 1]])
+    power = jnp.block([[trace, turn], [turn[:, None], symmetric - trace * jnp.eye(3)]])
+    power = power + 2 * jnp.eye(4)  # eigenvalues are within √3 of zero: the first becomes the largest in size
+    for _ in range(9):
+        power = jnp.sum(power[:, :, None] * power[None], axis=1)
+        power = power / jnp.trace(power)
+    # Every column tends to a multiple of the eigenvector; the longest one is never zero.
+    column = power[:, jnp.argmax(jnp.diagonal(power))]
+    w, x, y, z = column / jnp.sqrt(jnp.sum(column**2))
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def procrustes(source: Array, target: Array, weights: Array, *, stiffness: float = 0.0) -> Rigid:

@@ -47,9 +47,9 @@ class ModelConfig:
     key_width: int = 32
     sharpness: float = 4.0
     octaves: int = 4
-    lookups: int = 256
+    lookups: int = 512
     consensus: int = 12
-    hypotheses: int = 0
+    hypotheses: int = 64
     steps: int = 3
     points: int = 512
 

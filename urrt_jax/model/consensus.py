@@ -1,8 +1,8 @@
 """Consensus: the transform on which landmarks agree, of which many may be misplaced.
 
-Where asked for, hypotheses come first: what single landmarks and those compatible with them would say, two landmarks
-being compatible where they are as far apart in one cloud as in the other (Leordeanu and Hebert 2005) and have
-compatible landmarks in common (Chen et al. 2022, SC2-PCR). Rounds of weighing and aligning start from the best one.
+First hypotheses: what single landmarks and those compatible with them would say, two landmarks being compatible where
+they are as far apart in one cloud as in the other (Leordeanu and Hebert 2005) and have compatible landmarks in common
+(Chen et al. 2022, SC2-PCR). The best one is where rounds of weighing and aligning start.
 """
 
 import math
@@ -14,8 +14,9 @@ import numpy as np
 from jax import Array
 
 from urrt_jax.geometry import rigid
-from urrt_jax.geometry.rigid import Rigid, procrustes
+from urrt_jax.geometry.rigid import Rigid, procrustes, quick_rotation
 
+_HIGHEST = jax.lax.Precision.HIGHEST
 # Lengths and areas in a frame of unit radius.
 _STIFFNESS = 1e-3  # far below the spread of landmarks that mean anything
 _TOLERANCE = 0.01  # landmarks this near to each other agree
@@ -47,21 +48,24 @@ def align_landmarks(
         share = _best_hypothesis(source, target, given, seeds)
 
     def agreeing(share: Array, _: None) -> tuple[Array, None]:
-        return _weigh(source, target, given, share)[0], None
+        return _weigh(source, target, given, share), None
 
     share, _ = jax.lax.scan(agreeing, share, None, length=rounds)
     return procrustes(source, target, share, stiffness=_STIFFNESS)
 
 
 def _shares(weights: Array) -> Array:
-    return weights / jnp.maximum(jnp.sum(weights), 1e-12)
+    """The weights over their sum, however small; zeros stay."""
+    largest = jax.lax.stop_gradient(jnp.max(weights))
+    weights = weights / jnp.where(largest > 0, largest, 1.0)
+    return weights / jnp.maximum(jnp.sum(weights), 1.0)
 
 
-def _weigh(source: Array, target: Array, given: Array, share: Array) -> tuple[Array, Array]:
-    """The shares (M,) after a round, from those before it, and the squared distances (M,) that they go by."""
+def _weigh(source: Array, target: Array, given: Array, share: Array) -> Array:
+    """The shares (M,) after a round, from those before it."""
     found = procrustes(source, target, share, stiffness=_STIFFNESS)
     square = jnp.sum((rigid.apply(found, source) - target) ** 2, axis=-1)
-    return _shares(given / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2), square
+    return _shares(given / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2)
 
 
 def even_seeds(groups: Sequence[int], count: int) -> np.ndarray:
@@ -82,16 +86,34 @@ def _best_hypothesis(source: Array, target: Array, given: Array, seeds: np.ndarr
     """The shares (M,) of the hypothesis that misses the fewest landmarks by the least, the given shares being one."""
     fits = _compatibility(source, target, seeds)
     backed = fits * jnp.matmul(fits[:, seeds] * given[seeds], fits)
-
-    def after_two_rounds(share: Array) -> tuple[Array, Array]:
-        share, _ = _weigh(source, target, given, share)
-        share, square = _weigh(source, target, given, share)
-        # Which one is best is a choice, and has no derivative.
-        return share, jnp.sum(jax.lax.stop_gradient(given) / (1 + jnp.sqrt(jax.lax.stop_gradient(square)) / _NEAR))
-
     start = jnp.concatenate([given[None], jax.vmap(_shares)(given * backed**2)])
-    shares, gains = jax.vmap(after_two_rounds)(start)
-    return shares[jnp.argmax(gains)]
+    # Which one is best is a choice, and has no derivative; what the best one says has.
+    gains = _gains(*jax.lax.stop_gradient((source, target, given, start)))
+    return start[jnp.argmax(gains)]
+
+
+def _gains(source: Array, target: Array, given: Array, start: Array) -> Array:
+    """How much of the landmarks' weight agrees with each hypothesis (H,), two rounds after its shares (H, M).
+
+    Moments are linear in the products of two places, which are made once.
+    """
+    outer = (target[:, :, None] * source[:, None, :]).reshape(-1, 9)
+    products = jnp.concatenate([source, target, outer], axis=1)
+
+    def squares(share: Array) -> Array:
+        mean = jnp.matmul(share, products, precision=_HIGHEST)
+        here, there, moment = mean[:3], mean[3:6], mean[6:].reshape(3, 3)
+        rotation = quick_rotation(moment - there[:, None] * here + _STIFFNESS * jnp.eye(3))
+        shift = there - jnp.sum(rotation * here, axis=1)
+        # Coordinate by coordinate, so that no moved places are kept of every hypothesis.
+        return sum((jnp.sum(rotation[k] * source, axis=1) + shift[k] - target[:, k]) ** 2 for k in range(3))
+
+    def gain(share: Array) -> Array:
+        square = squares(share)
+        square = squares(_shares(given / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2))
+        return jnp.sum(given / (1 + jnp.sqrt(square) / _NEAR))
+
+    return jax.vmap(gain)(start)
 
 
 def _compatibility(source: Array, target: Array, seeds: np.ndarray) -> Array:

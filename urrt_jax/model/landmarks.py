@@ -22,6 +22,8 @@ from urrt_jax.geometry.clouds import Cloud
 from urrt_jax.model.blocks import Perceptron, region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
 
+_BLOCK = 64  # queries
+
 
 class Queries(NamedTuple):
     """What is asked for: M landmarks.
@@ -120,7 +122,16 @@ def point_queries(config: ModelConfig, params: dict, keys: Array, real: Array) -
 
 
 def place_landmarks(queries: Array, keys: Array, cloud: Cloud) -> Array:
-    """Places (M, 3) in a cloud of N points, from queries (M, c) and the points' keys (N, c)."""
+    """Places (M, 3) in a cloud of N points, from queries (M, c) and the points' keys (N, c).
+
+    Queries go through in blocks, so that a block's logits stay in a processor's cache however many pairs there are.
+    """
+    count = queries.shape[0]
+    blocks = jnp.pad(queries, ((0, -count % _BLOCK), (0, 0))).reshape(-1, _BLOCK, keys.shape[1])
+    return jax.lax.map(jax.checkpoint(lambda block: _place(block, keys, cloud)), blocks).reshape(-1, 3)[:count]
+
+
+def _place(queries: Array, keys: Array, cloud: Cloud) -> Array:
     logits = jnp.where(cloud.mask, (queries / jnp.sqrt(keys.shape[1])) @ keys.T, -1e9)
     shares = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
     # A softmax, but its sums are made with those of the points: one passage over the matrix less.

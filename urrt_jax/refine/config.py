@@ -34,7 +34,7 @@ class ICP:
     points: int = 2048
     iterations: int = 80
     inlier_distance: float = 1.0
-    plane: float = 0.97
+    plane: float = 0.9
     normal_radius: float = 3.0
     mutual: bool = False
     trim: bool = False

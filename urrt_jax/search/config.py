@@ -17,7 +17,8 @@ class Search:
         agrees with a pose that brings its ends closer than this.
       matches: hypotheses from matched features, at most; 0 for none.
       support: matches that a hypothesis is made of, besides its first.
-      rotations: members of the cover of SO(3) at which the network is asked: 0, 1 (the clouds as they are), 24 or 60.
+      rotations: members of the cover of SO(3) at which the network makes a step: 0, 1 (the clouds as they are), 24 or
+        60.
       max_angle: hypotheses that turn by more, in degrees, are not considered: shapes that are nearly symmetric often
         fit as well when turned around, and who knows better should say so.
       kept: hypotheses that are refined on the subsample.

@@ -1,15 +1,17 @@
 """The search itself: hypotheses, their scores, the best few refined, the best of those."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax.assessment import agreement
 from urrt_jax.features import fpfh
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud, centroid, subsample
-from urrt_jax.geometry.neighbors import nearest, spacing
+from urrt_jax.geometry.neighbors import spacing
 from urrt_jax.geometry.normals import normals
 from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
@@ -42,10 +44,10 @@ def search(model: Model, source: Cloud | Prepared, target: Cloud | Prepared, con
     """The best pose among all hypotheses, of two clouds normalised together (``normalize_pair``).
 
     Hypotheses come from matched features (``poses_from_matches``), which partial overlap and any rotation leave alone,
-    and from the network at every member of a cover of SO(3), which sparse and noisy clouds leave alone; ``plain``, the
-    estimate at hand, is one more. All are scored by how well the subsamples lie on each other in both directions, the
-    best ``config.kept`` refined, and the best of those returned; ``plain``, with a score of 0, where none turns by less
-    than the largest angle. A pure function: nothing is drawn.
+    and from a step of the network at every member of a cover of SO(3), which sparse and noisy clouds leave alone;
+    ``plain``, the estimate at hand, is one more. All are scored by how well the subsamples lie on each other in both
+    directions, the best ``config.kept`` refined, and the best of those returned; ``plain``, with a score of 0, where
+    none turns by less than the largest angle. A pure function: nothing is drawn.
     """
     # It is a choice: derivatives pass through what follows it.
     model, plain = jax.tree.map(jax.lax.stop_gradient, (model, plain))
@@ -60,15 +62,15 @@ def search(model: Model, source: Cloud | Prepared, target: Cloud | Prepared, con
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *guesses)
 
     reach = config.inlier_distance * width
-    some = [jax.tree.map(lambda leaf: leaf[:_SCORED_POINTS], cloud) for cloud in small]
+    some = _first(small[0]), _first(small[1])
     # Before refinement a hypothesis may be a few spacings off.
-    first = jax.lax.map(lambda pose: _score(pose, small, some, 3 * reach), every, batch_size=16)
+    first = jax.lax.map(lambda pose: agreement(pose, small, some, 3 * reach), every, batch_size=16)
     first = jnp.where(_allowed(every, config), first, -1.0)
     _, best = jax.lax.top_k(first, min(config.kept, len(first)))
 
     def refined(pose: Rigid) -> tuple[Rigid, Array]:
         better = anneal(*small, pose, 3 * reach, reach, iterations=_STEPS)
-        return better, _score(better, small, small, reach)
+        return better, agreement(better, small, small, reach)
 
     poses, scores = jax.vmap(refined)(jax.tree.map(lambda leaf: leaf[best], every))
     scores = jnp.where(_allowed(poses, config), scores, -1.0)
@@ -79,6 +81,10 @@ def search(model: Model, source: Cloud | Prepared, target: Cloud | Prepared, con
 
 def _subsample(cloud: Prepared, count: int) -> Cloud:
     return subsample(cloud.cloud, count, order=cloud.order)
+
+
+def _first(cloud: Cloud) -> Cloud:
+    return jax.tree.map(lambda leaf: leaf[:_SCORED_POINTS], cloud)
 
 
 def _allowed(poses: Rigid, config: Search) -> Array:
@@ -102,25 +108,12 @@ def _from_features(
 
 
 def _from_network(model: Model, source: Cloud, target: Cloud, rotations: int) -> Rigid:
-    """The network's estimates, with the source turned by every member of the cover."""
+    """The network's estimates after one step, with the source turned by every member of the cover."""
+    once = dataclasses.replace(model, config=dataclasses.replace(model.config, steps=1))
     # Farthest-point samples: their first points are a coarser one.
     source, target = (jax.tree.map(lambda leaf: leaf[: model.config.points], cloud) for cloud in (source, target))
 
     def at(rotation: Array) -> Rigid:
-        return estimate(model, source, target, Rigid(rotation, jnp.zeros(3))).transform
+        return estimate(once, source, target, Rigid(rotation, jnp.zeros(3))).transform
 
     return jax.lax.map(at, jnp.asarray(rotation_cover(rotations)), batch_size=8)
-
-
-def _score(pose: Rigid, clouds: tuple[Cloud, Cloud], asked: list[Cloud] | tuple[Cloud, Cloud], reach: Array) -> Array:
-    """How well two clouds lie on each other, asked at some of their points: the mean of both directions, in [0, 1]."""
-
-    def share(points: Array, mask: Array, other: Cloud) -> Array:
-        squared = nearest(points, other).squared
-        closeness = jnp.where(mask & jnp.isfinite(squared), jnp.maximum(1 - squared / reach**2, 0.0), 0.0)
-        return jnp.sum(closeness) / jnp.maximum(jnp.sum(mask), 1)
-
-    (source, target), (ask_source, ask_target) = clouds, asked
-    forth = share(rigid.apply(pose, ask_source.points), ask_source.mask, target)
-    back = share(rigid.apply(rigid.inverse(pose), ask_target.points), ask_target.mask, source)
-    return (forth + back) / 2

@@ -30,6 +30,7 @@ class PairConfig:
       ramp_share: ... over this share, up to
       corrupted: the share of pairs that are corrupted at the end.
       noise: standard deviation of the coordinates' Gaussian noise is uniform in [0, noise], clipped at 0.05.
+      cropped: share of the clouds of corrupted pairs that are cropped, each for itself.
       keep: a crop keeps a share of the points that is uniform in [keep, 1].
       outliers: share of points replaced by Gaussian ones is uniform in [0, outliers].
       outlier_sigma: their standard deviation.
@@ -44,12 +45,13 @@ class PairConfig:
     ramp_share: float = 0.1
     corrupted: float = 0.75
     noise: float = 0.02
-    keep: float = 0.6
+    cropped: float = 0.75
+    keep: float = 0.5
     outliers: float = 0.2
     outlier_sigma: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("signed", "both_ways", "clean_share", "ramp_share", "corrupted", "keep", "outliers"):
+        for name in ("signed", "both_ways", "clean_share", "ramp_share", "corrupted", "cropped", "keep", "outliers"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")
         if self.points < 3:
@@ -151,7 +153,7 @@ def make_pair(
         cloud = Cloud(points, mask)
         level = jnp.where(jax.random.bernoulli(next(keys), 0.25), jax.random.uniform(next(keys)), 0.0)
         cloud = add_outliers(next(keys), cloud, config.outliers * level, config.outlier_sigma)
-        level = jnp.where(jax.random.bernoulli(next(keys), 0.5), jax.random.uniform(next(keys)), 0.0)
+        level = jnp.where(jax.random.bernoulli(next(keys), config.cropped), jax.random.uniform(next(keys)), 0.0)
         return crop(next(keys), cloud, 1 - (1 - config.keep) * level)
 
     every = jnp.ones(config.points, bool)

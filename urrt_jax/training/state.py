@@ -32,14 +32,16 @@ class TrainConfig:
       chamfer_scale: scale of the Chamfer penalty, in units of the normalised pair.
       loss_points: points of each whole cloud that the Chamfer loss compares.
       unrolled: steps of the network that training runs, at most the model's; later ones see what the last of them saw.
-      rounds: of consensus among landmarks in training, at most the model's: fresh landmarks have none to find.
+      lookups: points of each cloud that training looks up, at most the model's.
+      rounds: of consensus among landmarks in training, at most the model's, and no hypotheses: fresh landmarks agree on
+        nothing.
       steps_per_call: steps that run as one dispatch (``lax.scan``).
       seed: of the initial weights and of every pair.
     """
 
     model: ModelConfig = ModelConfig()
     pairs: PairConfig = PairConfig()
-    steps: int = 5_000
+    steps: int = 8_000
     batch: int = 32
     learning_rate: float = 1e-3
     warmup: int = 200
@@ -50,13 +52,14 @@ class TrainConfig:
     chamfer_scale: float = 0.1
     loss_points: int = 512
     unrolled: int = 2
-    rounds: int = 3
+    lookups: int = 256
+    rounds: int = 4
     steps_per_call: int = 1
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_whole(self, steps=1, batch=1, occupancy_queries=1, loss_points=1)
-        check_whole(self, unrolled=1, rounds=0, steps_per_call=1, seed=0)
+        check_whole(self, unrolled=1, lookups=0, rounds=0, steps_per_call=1, seed=0)
         check_positive(self, "learning_rate", "clip", "chamfer_scale")
         for name in ("warmup", "weight_decay", "occupancy_weight"):
             if getattr(self, name) < 0:
@@ -67,9 +70,14 @@ class TrainConfig:
             raise ValueError(f"loss_points: {self.loss_points} exceeds the {self.pairs.points} points of a pair")
 
     def training_network(self) -> ModelConfig:
-        """The network as training runs it: fewer steps and rounds, and no hypotheses; the parameters are the same."""
-        steps, rounds = min(self.unrolled, self.model.steps), min(self.rounds, self.model.consensus)
-        return dataclasses.replace(self.model, steps=steps, consensus=rounds, hypotheses=0)
+        """The network as training runs it: the parameters are the same, but it does less."""
+        return dataclasses.replace(
+            self.model,
+            steps=min(self.unrolled, self.model.steps),
+            lookups=min(self.lookups, self.model.lookups),
+            consensus=min(self.rounds, self.model.consensus),
+            hypotheses=0,
+        )
 
 
 @jax.tree_util.register_dataclass
