@@ -106,7 +106,8 @@ def _gains(source: Array, target: Array, given: Array, start: Array) -> Array:
         rotation = quick_rotation(moment - there[:, None] * here + _STIFFNESS * jnp.eye(3))
         shift = there - jnp.sum(rotation * here, axis=1)
         # Coordinate by coordinate, so that no moved places are kept of every hypothesis.
-        return sum((jnp.sum(rotation[k] * source, axis=1) + shift[k] - target[:, k]) ** 2 for k in range(3))
+        x, y, z = (jnp.sum(rotation[k] * source, axis=1) + shift[k] - target[:, k] for k in range(3))
+        return x**2 + y**2 + z**2
 
     def gain(share: Array) -> Array:
         square = squares(share)
