@@ -248,7 +248,7 @@ def test_corrupted_pairs_are_finite_and_keep_points(corrupted):
     for cloud in (corrupted.source, corrupted.target):
         assert bool(jnp.all(jnp.isfinite(cloud.points)))
         np.testing.assert_array_equal(np.asarray(cloud.points)[~np.asarray(cloud.mask)], 0)
-        assert int(cloud.mask.sum(axis=1).min()) >= int(0.6 * 32) - 1
+        assert int(cloud.mask.sum(axis=1).min()) >= int(_CONFIG.keep * 32) - 1
 
 
 def test_shape_with_fewer_points_than_asked_for_is_drawn_with_repetition(shapes):
