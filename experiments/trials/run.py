@@ -4,7 +4,7 @@
 
 Every trial trains one configuration with one change, for 300 steps of the usual mixture, and is measured on the
 protocols of the tables, network alone, with every second shape held out of the training split; no test shape is looked
-at. A trial takes some five minutes of two cores. Runs are kept in runs/ beside this file: an interrupted
+at. A trial takes some three minutes of two cores. Runs are kept in runs/ beside this file: an interrupted
 command continues where it stopped. Writes results.json and table.md beside this file, with the trials that are there.
 """
 
