@@ -1,16 +1,22 @@
 """The paper's ablation: models A, B and C trained alike, three seeds each, one step, without refinement.
 
-    python experiments/ablation/run.py --data PATH [--steps 400] [--decoder landmarks]
+    python experiments/ablation/run.py --data PATH [--decoder landmarks pose]
 
-Training pairs follow DCP's clean protocol, as in the paper, and every model sees the same ones. All see the
-surroundings of points and answer by the landmarks of their regions, after three rounds of consensus (or regress the
-pose, with --decoder pose); points are not looked up, which needs no regions and would hide what they are for. Model A,
-which has none, has as many landmarks as the regions of the others together. Checkpoints are chosen on shapes held out
-of the training split; the table is over all test shapes. Runs are kept in runs/ beside this file: an interrupted
-command continues where it stopped. Writes results.json and table.md beside this file.
+Training pairs follow DCP's clean protocol, as in the paper, and every model sees the same ones. The models are compared
+with either kind of decoder:
+
+* pose: as the paper may mean it. Points are known by their coordinates alone, and decoders regress the pose.
+* landmarks: points see their surroundings, and decoders answer by landmarks, aligned after three rounds of consensus.
+  Points are not looked up, which needs no regions and would hide what they are for. Model A, which has none, has as
+  many landmarks as the regions of the others together.
+
+Checkpoints are chosen on shapes held out of the training split; the table is over all test shapes. Runs are kept in
+runs/ beside this file: an interrupted command continues where it stopped. Writes results.json and table.md beside this
+file.
 """
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +25,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from urrt_jax.data import load_shapes
+from urrt_jax.data import Shapes, load_shapes
 from urrt_jax.evaluation import evaluate
 from urrt_jax.evaluation.methods import Ours
 from urrt_jax.model import ModelConfig
@@ -38,27 +44,40 @@ PAPER = {
 Variant = Literal["A", "B", "C"]
 Decoder = Literal["landmarks", "pose"]
 VARIANTS: tuple[Variant, ...] = ("A", "B", "C")
+DECODERS: tuple[Decoder, ...] = ("pose", "landmarks")
 
 
-def configured(variant: Variant, decoder: Decoder, seed: int, steps: int) -> TrainConfig:
+def configured(variant: Variant, decoder: Decoder, seed: int) -> TrainConfig:
     """How one of the models is trained."""
-    landmarks = 64 if variant == "A" else 8
+    if decoder == "pose":
+        model = ModelConfig(
+            variant=variant, decoder="pose", octaves=0, lookups=0, consensus=0, hypotheses=0, steps=1, points=256
+        )
+        steps, points, loss_points = 1_500, 512, 256
+    else:
+        landmarks = 64 if variant == "A" else 8
+        model = ModelConfig(variant=variant, landmarks=landmarks, lookups=0, consensus=3, hypotheses=0, steps=1)
+        steps, points, loss_points = 300, 1024, 512
     return TrainConfig(
-        model=ModelConfig(
-            variant=variant,
-            decoder=decoder,
-            landmarks=landmarks,
-            lookups=0,
-            consensus=3,
-            hypotheses=0,
-            steps=1,
-            points=512,
-        ),
-        pairs=PairConfig(corrupted=0.0, signed=0.0, both_ways=0.0),
+        model=model,
+        pairs=PairConfig(points=points, corrupted=0.0, signed=0.0, both_ways=0.0),
+        loss_points=loss_points,
         steps=steps,
         steps_per_call=10,
         seed=seed,
     )
+
+
+def measured(variant: Variant, decoder: Decoder, shapes: Shapes, test: Shapes) -> dict[str, Any]:
+    """The row of one model: its figures over all test shapes, for every seed."""
+    found, configs = [], [configured(variant, decoder, seed) for seed in SEEDS]
+    for config in configs:
+        held_in, held_out = shapes.split_validation(0.05, config.seed)
+        run = HERE / "runs" / f"{variant}_{decoder}_{config.seed}_{config.steps}"
+        model = train(config, held_in, held_out, run, loop=LoopConfig(every=config.steps // 2))
+        found.append(evaluate(Ours(model=model, refine=None), "dcp", test.points, progress=False).summary())
+    values = {name: [one[name] for one in found] for name in METRICS}
+    return {"variant": variant, "decoder": decoder, "steps": configs[0].steps} | values
 
 
 def as_markdown(results: dict[str, Any]) -> str:
@@ -70,7 +89,7 @@ def as_markdown(results: dict[str, Any]) -> str:
             values, digits = np.array(row[name]), 4 if name.endswith("translation") else 3
             unit = "°" if name.endswith("rotation") else ""
             cells.append(f"{values.mean():.{digits}f}{unit} ± {values.std(ddof=1):.{digits}f}")
-        lines.append(f"| {row['variant']}, {row['decoder']} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['variant']}, {row['decoder']}, {row['steps']:,} steps | " + " | ".join(cells) + " |")
     for variant, (rmse, mae, rmse_t, mae_t) in PAPER.items():
         lines.append(f"| *{variant} (paper)* | *{rmse:.3f}°* | *{mae:.3f}°* | *{rmse_t:.4f}* | *{mae_t:.4f}* | |")
     return "\n".join(lines) + "\n"
@@ -79,32 +98,21 @@ def as_markdown(results: dict[str, Any]) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
-    parser.add_argument("--steps", type=int, default=400, help="of every run")
-    parser.add_argument("--decoder", choices=("landmarks", "pose"), default="landmarks", help="what decoders give")
+    parser.add_argument("--decoder", nargs="+", choices=DECODERS, default=DECODERS, help="what decoders give")
     flags = parser.parse_args()
-    if flags.steps < 100 or flags.steps % 100:
-        parser.error(f"--steps: expected a multiple of 100, got {flags.steps}")
     shapes, test = load_shapes(flags.data, points=1024), load_shapes(flags.data, split="test", points=1024)
-    rows: list[dict[str, Any]] = []
-    results = {
-        "command": f"python experiments/ablation/run.py --data {Path(flags.data).name} "
-        f"--steps {flags.steps} --decoder {flags.decoder}",
-        "jax": jax.__version__,
-        "steps": flags.steps,
-        "seeds": SEEDS,
-        "rows": rows,
-    }
-    for variant in tqdm(VARIANTS, unit="model"):
-        found = []
-        for seed in SEEDS:
-            config = configured(variant, flags.decoder, seed, flags.steps)
-            held_in, held_out = shapes.split_validation(0.05, seed)
-            run = HERE / "runs" / f"{variant}_{flags.decoder}_{seed}_{flags.steps}"
-            model = train(config, held_in, held_out, run, loop=LoopConfig(every=flags.steps // 2))
-            found.append(evaluate(Ours(model=model, refine=None), "dcp", test.points, progress=False).summary())
-        rows.append(
-            {"variant": variant, "decoder": flags.decoder} | {name: [one[name] for one in found] for name in METRICS}
-        )
-        (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-        (HERE / "table.md").write_text(as_markdown(results))
-    print(as_markdown(results))
+    written = HERE / "results.json"
+    before = json.loads(written.read_text())["rows"] if written.exists() else []
+    rows = {(row["decoder"], row["variant"]): row for row in before}
+    for decoder in flags.decoder:
+        for variant in tqdm(VARIANTS, desc=decoder, unit="model"):
+            rows[decoder, variant] = measured(variant, decoder, shapes, test)
+            results = {
+                "command": f"python experiments/ablation/run.py --data {Path(flags.data).name}",
+                "jax": jax.__version__,
+                "seeds": SEEDS,
+                "rows": [rows[each] for each in itertools.product(DECODERS, VARIANTS) if each in rows],
+            }
+            written.write_text(json.dumps(results, indent=1) + "\n")
+            (HERE / "table.md").write_text(as_markdown(results))
+    print((HERE / "table.md").read_text())

@@ -3,11 +3,11 @@
     python experiments/benchmarks/speed.py [--data PATH] [--pairs 256]
 
 Pairs follow the clean DCP protocol, 1,024 points, on the test split of PATH (procedural shapes by default). Each figure
-is taken after a warm-up that compiles: the median of the repeats, for peers the mean over the pairs, for the large
-pairs one run in a process of its own, with its peak of memory. Where PATH holds the scans, register with search and the
-peers for scans are timed on the same 12 pairs (the last column is their share within 1°). The command line is timed as
-whole processes on two files of 40,000 points: the first run compiles. Peers are optional:
-`pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
+is taken after a warm-up that compiles: for ours in batches, and for peers on the same pairs, the median of rounds in
+which each takes its turn; for the large pairs one run in a process of its own, with its peak of memory. Where PATH
+holds the scans, register with search and the peers for scans are timed on the same 12 pairs (the last column is their
+share within 1°). The command line is timed as whole processes on two files of 40,000 points: the first run compiles.
+Peers are optional: `pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1 libegl1 libgomp1.
 """
 
 import argparse
@@ -124,12 +124,50 @@ def measure_scans(path: Path) -> list[dict]:
     return rows
 
 
+def side_by_side(batched: dict[str, Callable], batches: list, trials: list, repeats: int) -> list[dict]:
+    """Ours in batches and the peers pair by pair, on the same pairs; in every round each of them once.
+
+    A machine is not always equally fast: what takes turns is slowed alike.
+    """
+    truth = np.stack([trial.rotation for trial in trials]), np.stack([trial.translation for trial in trials])
+    rows, peers = [], {}
+    for name in PEERS_TIMED:
+        try:
+            versions = PEERS[name].versions()
+        except ImportError as error:
+            rows.append({"method": f"{PEERS[name].title}: not measured, {error}"})
+            continue
+        peers[f"{PEERS[name].title} {' '.join(versions.values())}, one pair a call"] = PEERS[name]
+    ours = {f"{name}, batches of {BATCH}": function for name, function in batched.items()}
+    for function in ours.values():
+        jax.block_until_ready(function(*batches[0]))
+    times, poses = {name: [] for name in (*ours, *peers)}, {}
+    for _ in tqdm(range(repeats), desc="rounds"):
+        for name, function in ours.items():
+            start = time.perf_counter()
+            found = jax.block_until_ready([function(*batch) for batch in batches])
+            times[name].append(time.perf_counter() - start)
+            poses[name] = [np.concatenate([getattr(one, key) for one in found]) for key in ("rotation", "translation")]
+        for name, peer in peers.items():
+            if poses.get(name) and name.startswith(PEERS["icp_starts"].title):
+                continue  # many times slower than all others together: once is enough
+            start = time.perf_counter()
+            found = np.stack(
+                [peer.align_pair(each.source.astype(np.float64), each.target.astype(np.float64)) for each in trials]
+            )
+            times[name].append(time.perf_counter() - start)
+            poses[name] = [found[:, :3, :3], found[:, :3, 3]]
+    measured = [
+        row(name, statistics.median(took) / len(trials), summarize(pose_errors(*poses[name], *truth))["recall_1deg"])
+        for name, took in times.items()
+    ]
+    return measured + rows
+
+
 def measure(data: str, pairs: int, repeats: int) -> dict:
     shapes = load_shapes(data, split="test", points=1024, limit=pairs)
     trials = [PROTOCOLS["dcp"](shapes.points, item) for item in range(len(shapes))]
-    sources, targets, rotations, translations = (
-        np.stack(values) for values in zip(*(trial[:4] for trial in trials), strict=True)
-    )
+    sources, targets = (np.stack(values) for values in list(zip(*trials, strict=True))[:2])
     model = load_model()
 
     network = jax.jit(jax.vmap(lambda a, b: predict(model, make_cloud(a), make_cloud(b))))
@@ -140,16 +178,7 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
     ]
     count = BATCH * len(batches)
 
-    def run_all(function: Callable) -> list:
-        return jax.block_until_ready([function(*batch) for batch in batches])
-
-    rows = []
-    for name, function in (("network alone, batches of 64", network), ("register, batches of 64", refined)):
-        took = seconds(lambda function=function: run_all(function), repeats)
-        results = run_all(function)
-        found = [np.concatenate([getattr(r, key) for r in results]) for key in ("rotation", "translation")]
-        errors = pose_errors(found[0], found[1], rotations[:count], translations[:count])
-        rows.append(row(name, took / count, summarize(errors)["recall_1deg"]))
+    rows = side_by_side({"network alone": network, "register": refined}, batches, trials[:count], repeats)
 
     single, pair = [], (jnp.asarray(sources[0]), jnp.asarray(targets[0]))
     jax.block_until_ready(register(pair[0], pair[1]))
@@ -166,22 +195,6 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
         large = json.loads(done.stdout)
         rows.append(row(f"register, one pair of {size:,} points: {large['peak_gib']:.2f} GiB", large["seconds"], None))
 
-    for name in PEERS_TIMED:
-        peer = PEERS[name]
-        try:
-            versions = peer.versions()
-        except ImportError as error:
-            rows.append({"method": f"{peer.title}: not measured, {error}"})
-            continue
-        single, matrices = [], []
-        for item in tqdm(range(count), desc=peer.title):
-            start = time.perf_counter()
-            matrices.append(peer.align_pair(sources[item].astype(np.float64), targets[item].astype(np.float64)))
-            single.append(time.perf_counter() - start)
-        stacked = np.stack(matrices)
-        errors = pose_errors(stacked[:, :3, :3], stacked[:, :3, 3], rotations[:count], translations[:count])
-        title = f"{peer.title} {' '.join(versions.values())}, one pair a call"
-        rows.append(row(title, statistics.mean(single), summarize(errors)["recall_1deg"]))
     if (Path(data) / SCANS).is_file():
         rows += measure_scans(Path(data) / SCANS)
     return {
@@ -224,7 +237,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", help="ModelNet40 as 'urrt evaluate' takes it; by default $URRT_DATA, else procedural")
     parser.add_argument("--pairs", type=int, default=256, help="how many pairs, a multiple of 64")
-    parser.add_argument("--repeats", type=int, default=5, help="timed repeats of the batched rows")
+    parser.add_argument("--repeats", type=int, default=5, help="rounds in which ours and peers take turns")
     parser.add_argument("--large", type=int, help="measure only one pair of so many points and print it as JSON")
     given = parser.parse_args()
     if given.large:

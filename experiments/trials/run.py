@@ -2,10 +2,11 @@
 
     python experiments/trials/run.py --data PATH [--only NAME ...]
 
-Every trial trains one configuration with one change, for 300 steps of the usual mixture, and is measured on the
-protocols of the tables, network alone, with every second shape held out of the training split; no test shape is looked
-at. A trial takes some three minutes of two cores. Runs are kept in runs/ beside this file: an interrupted
-command continues where it stopped. Writes results.json and table.md beside this file, with the trials that are there.
+Every trial trains one configuration with one change, for 300 steps of 16 pairs of the usual mixture, and is measured on
+the protocols of the tables, network alone, with every second shape held out of the training split; no test shape is
+looked at. What changes only in use is measured with the weights of the base. A trial takes some minutes of one core.
+Runs are kept in runs/ beside this file: an interrupted command continues where it stopped. Writes results.json and
+table.md beside this file, with the trials that are there.
 """
 
 import argparse
@@ -34,7 +35,9 @@ PROTOCOLS = {
     "outliers": "D.O.",
     "independent_noise": "independent + noise",
 }
-BASE = TrainConfig(pairs=PairConfig(ramp_share=0.2), steps=300, learning_rate=1.5e-3, steps_per_call=10)
+BASE = TrainConfig(
+    pairs=PairConfig(ramp_share=0.2), steps=300, batch=16, warmup=50, learning_rate=1.5e-3, steps_per_call=10
+)
 TRIALS: dict[str, dict[str, Any]] = {
     "base: surroundings, look-ups, consensus": {},
     "landmarks of regions alone": {"model": {"sharpness": 1.0, "octaves": 0, "lookups": 0, "consensus": 0}},
@@ -48,10 +51,10 @@ TRIALS: dict[str, dict[str, Any]] = {
     "512 look-ups in training": {"lookups": 512},
     "sharpness 1": {"model": {"sharpness": 1.0}},
     "no consensus": {"model": {"consensus": 0}},
-    "4 rounds of consensus in use": {"model": {"consensus": 4}},
-    "24 rounds of consensus in use": {"model": {"consensus": 24}},
-    "no hypotheses in use": {"model": {"hypotheses": 0}},
-    "256 hypotheses in use": {"model": {"hypotheses": 256}},
+    "4 rounds of consensus in use": {"use": {"consensus": 4}},
+    "24 rounds of consensus in use": {"use": {"consensus": 24}},
+    "no hypotheses in use": {"use": {"hypotheses": 0}},
+    "256 hypotheses in use": {"use": {"hypotheses": 256}},
     "no rounds of consensus in training": {"rounds": 0},
     "12 rounds of consensus in training": {"rounds": 12},
     "decoders that regress the pose": {"model": {"decoder": "pose"}},
@@ -78,8 +81,8 @@ TRIALS: dict[str, dict[str, Any]] = {
     "Chamfer scale 0.3": {"chamfer_scale": 0.3},
     "learning rate 7.5e-4": {"learning_rate": 7.5e-4},
     "learning rate 3e-3": {"learning_rate": 3e-3},
-    "batches of 16, twice the steps": {"batch": 16, "steps": 600},
-    "batches of 64, half the steps": {"batch": 64, "steps": 150},
+    "batches of 8, twice the steps": {"batch": 8, "steps": 600},
+    "batches of 32, half the steps": {"batch": 32, "steps": 150},
     "first third clean": {"pairs": {"clean_share": 0.33}},
     "half of the clouds cropped": {"pairs": {"cropped": 0.5}},
     "crops of up to a quarter": {"pairs": {"keep": 0.75}},
@@ -88,17 +91,18 @@ TRIALS: dict[str, dict[str, Any]] = {
 
 
 def configured(changes: dict[str, Any]) -> TrainConfig:
-    """The base configuration with these changes; those of "model" and "pairs" apply to its parts."""
+    """How a trial is trained: the base with these changes; "model" and "pairs" change its parts, "use" nothing yet."""
     parts = {name: dataclasses.replace(getattr(BASE, name), **changes.get(name, {})) for name in ("model", "pairs")}
-    return dataclasses.replace(BASE, **{**changes, **parts})
+    return dataclasses.replace(BASE, **{name: value for name, value in changes.items() if name != "use"} | parts)
 
 
 def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
     """The row of one trial: trained, if its run is not there yet, and measured as all are."""
     config = configured(TRIALS[name])
     digest = hashlib.sha256(repr(config).encode()).hexdigest()[:8]
-    folder = HERE / "runs" / ("".join(letter if letter.isalnum() else "_" for letter in name) + f"_{digest}")
+    folder = HERE / "runs" / digest
     model = train(config, shapes, validation, folder, loop=LoopConfig(every=config.steps, validation_pairs=16))
+    model = dataclasses.replace(model, config=dataclasses.replace(model.config, **TRIALS[name].get("use", {})))
     log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     rates = [entry["pairs_per_second"] for entry in log if "pairs_per_second" in entry]
     method = Ours(model=model, refine=None)

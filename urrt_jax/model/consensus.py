@@ -6,15 +6,15 @@ they are as far apart in one cloud as in the other (Leordeanu and Hebert 2005) a
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.rigid import Rigid, procrustes, quick_rotation
+from urrt_jax.geometry.rigid import Rigid, nearest_rotation, procrustes, quick_rotation
 
 _HIGHEST = jax.lax.Precision.HIGHEST
 # Lengths and areas in a frame of unit radius.
@@ -22,7 +22,29 @@ _STIFFNESS = 1e-3  # far below the spread of landmarks that mean anything
 _TOLERANCE = 0.01  # landmarks this near to each other agree
 _MISFIT = 0.05  # of distances between landmarks: a quarter as compatible as without
 _BASELINE = 0.3  # landmarks this near to each other, and their misfits, tell half as much as distant ones
+_NOTHING = 1e-18  # the squares of smaller numbers are lost
 _NEAR = 0.05  # a hypothesis gains half of a landmark's weight where it misses it by this
+
+
+class _Landmarks(NamedTuple):
+    """Landmarks as rounds want them: long rows for vector instructions, and products whose weighted sums say all.
+
+    Attributes:
+      source: (3, M), coordinate by coordinate.
+      target: (3, M).
+      products: (M, 17): of every landmark 1, its places s and t, t ⊗ s and |s|² + |t|².
+    """
+
+    source: Array
+    target: Array
+    products: Array
+
+
+def _landmarks(source: Array, target: Array) -> _Landmarks:
+    outer = (target[:, :, None] * source[:, None, :]).reshape(-1, 9)
+    lengths = jnp.sum(source**2 + target**2, axis=1, keepdims=True)
+    products = jnp.concatenate([jnp.ones_like(lengths), source, target, outer, lengths], axis=1)
+    return _Landmarks(source.T, target.T, products)
 
 
 def align_landmarks(
@@ -42,30 +64,45 @@ def align_landmarks(
       seeds: (S,), rows of landmarks: the first round starts from the best of their hypotheses, or from the given
         weights where these are better.
     """
-    given = _shares(weights)
-    share = given
-    if rounds and seeds is not None and len(seeds):
-        share = _best_hypothesis(source, target, given, seeds)
-
-    def agreeing(share: Array, _: None) -> tuple[Array, None]:
-        return _weigh(source, target, given, share), None
-
-    share, _ = jax.lax.scan(agreeing, share, None, length=rounds)
-    return procrustes(source, target, share, stiffness=_STIFFNESS)
-
-
-def _shares(weights: Array) -> Array:
-    """The weights over their sum, however small; zeros stay."""
     largest = jax.lax.stop_gradient(jnp.max(weights))
-    weights = weights / jnp.where(largest > 0, largest, 1.0)
-    return weights / jnp.maximum(jnp.sum(weights), 1.0)
+    given = weights / jnp.where(largest > 0, largest, 1.0)
+    landmarks = _landmarks(source, target)
+    start = given
+    if rounds and seeds is not None and len(seeds):
+        start = _best_hypothesis(source, target, landmarks, given, seeds)
+
+    def agreeing(weights: Array, _: None) -> tuple[Array, None]:
+        return _weigh(landmarks, given, weights, nearest_rotation), None
+
+    weights, _ = jax.lax.scan(agreeing, start, None, length=rounds)
+    return procrustes(source, target, weights, stiffness=_STIFFNESS)
 
 
-def _weigh(source: Array, target: Array, given: Array, share: Array) -> Array:
-    """The shares (M,) after a round, from those before it."""
-    found = procrustes(source, target, share, stiffness=_STIFFNESS)
-    square = jnp.sum((rigid.apply(found, source) - target) ** 2, axis=-1)
-    return _shares(given / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2)
+def _weigh(landmarks: _Landmarks, given: Array, weights: Array, turn: Callable[[Array], Array]) -> Array:
+    """The weights (M,) after a round, from those before it."""
+    squares, mean = _misfits(landmarks, weights, turn)
+    return given / (1 + squares / (mean + _TOLERANCE**2)) ** 2
+
+
+def _misfits(landmarks: _Landmarks, weights: Array, turn: Callable[[Array], Array]) -> tuple[Array, Array]:
+    """Squared distances (M,) after the alignment with weights (M,) of any scale, and their mean under these.
+
+    ``turn`` makes a rotation of a moment. All sums over landmarks are one product with a matrix. The distances
+    themselves are made coordinate by coordinate: as products they would lose digits.
+    """
+    sums = jnp.matmul(weights, landmarks.products, precision=_HIGHEST)
+    sums = sums[1:] / jnp.where(sums[0] > 0, sums[0], 1.0)
+    here, there, lengths = sums[:3], sums[3:6], sums[15]
+    moment = sums[6:15].reshape(3, 3) - there[:, None] * here
+    rotation = turn(moment + _STIFFNESS * jnp.eye(3, dtype=moment.dtype))
+    shift = there - jnp.sum(rotation * here, axis=1)
+    x, y, z = landmarks.source
+    apart = [
+        rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + shift[k] - landmarks.target[k] for k in range(3)
+    ]
+    squares = apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
+    mean = lengths - jnp.sum(here**2) - jnp.sum(there**2) - 2 * jnp.sum(rotation * moment)
+    return squares, jnp.maximum(mean, 0.0)
 
 
 def even_seeds(groups: Sequence[int], count: int) -> np.ndarray:
@@ -82,39 +119,25 @@ def even_seeds(groups: Sequence[int], count: int) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _best_hypothesis(source: Array, target: Array, given: Array, seeds: np.ndarray) -> Array:
-    """The shares (M,) of the hypothesis that misses the fewest landmarks by the least, the given shares being one."""
+def _best_hypothesis(source: Array, target: Array, landmarks: _Landmarks, given: Array, seeds: np.ndarray) -> Array:
+    """The weights (M,) of the hypothesis that misses the fewest landmarks by the least; the given ones are one."""
     fits = _compatibility(source, target, seeds)
     backed = fits * jnp.matmul(fits[:, seeds] * given[seeds], fits)
-    start = jnp.concatenate([given[None], jax.vmap(_shares)(given * backed**2)])
+    # Against their own mean, however little speaks for a hypothesis; what is as good as nothing stays nothing.
+    mean = jax.lax.stop_gradient(jnp.matmul(backed, given / jnp.maximum(jnp.sum(given), 1.0)))
+    start = given * (backed / jnp.maximum(mean, _NOTHING)[:, None]) ** 2
     # Which one is best is a choice, and has no derivative; what the best one says has.
-    gains = _gains(*jax.lax.stop_gradient((source, target, given, start)))
-    return start[jnp.argmax(gains)]
+    fixed, trusted, tried = jax.lax.stop_gradient((landmarks, given, start))
+    gains = jax.vmap(lambda weights: _gain(fixed, trusted, weights))(tried)
+    best = jnp.argmax(gains)
+    return jnp.where(gains[best] > _gain(fixed, trusted, trusted), start[best], given)
 
 
-def _gains(source: Array, target: Array, given: Array, start: Array) -> Array:
-    """How much of the landmarks' weight agrees with each hypothesis (H,), two rounds after its shares (H, M).
-
-    Moments are linear in the products of two places, which are made once.
-    """
-    outer = (target[:, :, None] * source[:, None, :]).reshape(-1, 9)
-    products = jnp.concatenate([source, target, outer], axis=1)
-
-    def squares(share: Array) -> Array:
-        mean = jnp.matmul(share, products, precision=_HIGHEST)
-        here, there, moment = mean[:3], mean[3:6], mean[6:].reshape(3, 3)
-        rotation = quick_rotation(moment - there[:, None] * here + _STIFFNESS * jnp.eye(3))
-        shift = there - jnp.sum(rotation * here, axis=1)
-        # Coordinate by coordinate, so that no moved places are kept of every hypothesis.
-        x, y, z = (jnp.sum(rotation[k] * source, axis=1) + shift[k] - target[:, k] for k in range(3))
-        return x**2 + y**2 + z**2
-
-    def gain(share: Array) -> Array:
-        square = squares(share)
-        square = squares(_shares(given / (1 + square / (jnp.sum(share * square) + _TOLERANCE**2)) ** 2))
-        return jnp.sum(given / (1 + jnp.sqrt(square) / _NEAR))
-
-    return jax.vmap(gain)(start)
+def _gain(landmarks: _Landmarks, given: Array, weights: Array) -> Array:
+    """How much of the given weight agrees with the hypothesis of these weights (M,), two rounds after them, ()."""
+    weights = _weigh(landmarks, given, weights, quick_rotation)
+    squares, _ = _misfits(landmarks, weights, quick_rotation)
+    return jnp.matmul(1 / (1 + jnp.sqrt(squares) / _NEAR), given, precision=_HIGHEST)
 
 
 def _compatibility(source: Array, target: Array, seeds: np.ndarray) -> Array:

@@ -15,12 +15,11 @@ from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.consensus import align_landmarks, even_seeds
 from urrt_jax.model.encoding import Encoding
 from urrt_jax.model.landmarks import (
-    Queries,
     key_size,
     landmark_decoders,
+    lookup_weights,
     place_keys,
     place_landmarks,
-    point_queries,
     point_trust,
     region_queries,
     surroundings_keys,
@@ -53,25 +52,24 @@ def decode(config: ModelConfig, params: dict, source: Encoding, target: Encoding
     if config.decoder == "pose":
         return fuse_poses(decode_poses(config, params, *features), weights)
     queries = region_queries(config, params["landmarks"], *features, weights)
-    groups = [len(queries.weights)]
+    asked, groups, trust = len(queries.weights), [len(queries.weights)], [queries.weights]
     if config.lookups:
-        some = [_some_points(encoding, config.lookups) for encoding in (source, target)]
-        groups += [len(keys) for keys, _ in some]
-        asked = point_queries(config, params["trust"], *map(jnp.concatenate, zip(*some, strict=True)))
-        queries = Queries(*(jnp.concatenate(both) for both in zip(queries, asked, strict=True)))
-    places = place_landmarks(config.sharpness * queries.source, source.keys, source.cloud)
-    others = place_landmarks(config.sharpness * queries.target, target.keys, target.cloud)
+        keys, real, _ = map(jnp.concatenate, zip(source.lookups, target.lookups, strict=True))
+        groups += [len(source.lookups.real), len(target.lookups.real)]
+        trust.append(lookup_weights(config, params["trust"], keys, real))
+    here = _find(config, queries.source, target.lookups.keys, source)
+    there = _find(config, queries.target, source.lookups.keys, target)
+    # Landmarks of the decoders, then of the source's points, then of the target's, each in both clouds.
+    places = jnp.concatenate([here[:asked], source.lookups.places, here[asked:]])
+    others = jnp.concatenate([there, target.lookups.places])
     # As many of either cloud's points, so that swapped clouds have the same ones.
     seeds = even_seeds(groups, config.hypotheses)
-    return align_landmarks(places, others, queries.weights, rounds=config.consensus, seeds=seeds)
+    return align_landmarks(places, others, jnp.concatenate(trust), rounds=config.consensus, seeds=seeds)
 
 
-def _some_points(encoding: Encoding, count: int) -> tuple[Array, Array]:
-    """The keys and the mask of ``count`` points, evenly spread: outliers are first among farthest ones."""
-    keys, mask = encoding.keys, encoding.cloud.mask
-    rows, real = jnp.arange(min(count, mask.shape[0])), jnp.sum(mask)
-    rows = jnp.where(real > rows.shape[0], rows * real // rows.shape[0], rows)
-    return keys[rows], mask[rows]
+def _find(config: ModelConfig, queries: Array, others: Array, cloud: Encoding) -> Array:
+    """Where a cloud has what the decoders ask for, and the other cloud's points with their keys."""
+    return place_landmarks(config.sharpness * jnp.concatenate([queries, others]), cloud.keys, cloud.cloud)
 
 
 def fusion_weights(source_counts: Array, target_counts: Array) -> Array:

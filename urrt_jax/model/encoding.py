@@ -1,4 +1,4 @@
-"""What the network knows of one cloud in one pose: embeddings, regions, attended features, keys."""
+"""What the network knows of one cloud in one pose: embeddings, regions, attended features, keys, lookups."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from urrt_jax.geometry.clouds import Cloud
 from urrt_jax.model.attention import attend_regions
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.encoder import encode_points
-from urrt_jax.model.landmarks import point_keys
+from urrt_jax.model.landmarks import Lookups, look_up, point_keys
 from urrt_jax.model.partition import Regions, branch_logits, region_labels, split_regions, whole_region
 
 
@@ -22,12 +22,14 @@ class Encoding(NamedTuple):
       embedding: (d,), the shape embedding e.
       regions: its regions, with the attended features a; for model A a single one with the shape embedding.
       keys: (N, c), by which landmarks find points; (N, 0) where decoders give poses.
+      lookups: its points that are looked up in both clouds, already found in this one.
     """
 
     cloud: Cloud
     embedding: Array
     regions: Regions
     keys: Array
+    lookups: Lookups
 
 
 def encode_cloud(config: ModelConfig, params: dict, cloud: Cloud, invariants: Array) -> Encoding:
@@ -43,4 +45,4 @@ def encode_cloud(config: ModelConfig, params: dict, cloud: Cloud, invariants: Ar
         keys = jnp.zeros((features.shape[0], 0), features.dtype)
     else:
         keys = point_keys(config, params["decoder"], features, invariants)
-    return Encoding(cloud, embedding, regions, keys)
+    return Encoding(cloud, embedding, regions, keys, look_up(config, keys, cloud))

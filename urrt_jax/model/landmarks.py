@@ -39,6 +39,20 @@ class Queries(NamedTuple):
     weights: Array
 
 
+class Lookups(NamedTuple):
+    """L points of a cloud, which are looked up in both clouds.
+
+    Attributes:
+      keys: (L, c), theirs, which are what is asked for.
+      real: (L,) bool, False for padding.
+      places: (L, 3), where they are found in their own cloud.
+    """
+
+    keys: Array
+    real: Array
+    places: Array
+
+
 def place_keys(config: ModelConfig) -> nn.Module:
     """What makes keys (N, key_width) of where points lie, from their embeddings (N, d)."""
     return Perceptron((2 * config.key_width, config.key_width), normalize=True)
@@ -106,8 +120,19 @@ def point_trust() -> nn.Module:
     return Perceptron((32, 1), normalize=True)
 
 
-def point_queries(config: ModelConfig, params: dict, keys: Array, real: Array) -> Queries:
-    """The queries of points of either cloud: their own keys, in both clouds.
+def look_up(config: ModelConfig, keys: Array, cloud: Cloud) -> Lookups:
+    """The points of a cloud, with their keys (N, c), that are looked up: evenly spread.
+
+    Outliers are first among farthest ones.
+    """
+    rows, real = jnp.arange(min(config.lookups, cloud.mask.shape[0])), jnp.sum(cloud.mask)
+    rows = jnp.where(real > rows.shape[0], rows * real // max(rows.shape[0], 1), rows)
+    asked = keys[rows]
+    return Lookups(asked, cloud.mask[rows], place_landmarks(config.sharpness * asked, keys, cloud))
+
+
+def lookup_weights(config: ModelConfig, params: dict, keys: Array, real: Array) -> Array:
+    """How much the landmarks of points of either cloud, with keys (L, c), should count, (L,); padding does not.
 
     Together they count as much as the decoders' where all are equally trusted.
 
@@ -115,10 +140,10 @@ def point_queries(config: ModelConfig, params: dict, keys: Array, real: Array) -
       config: the network's.
       params: of ``point_trust``.
       keys: (L, c).
-      real: (L,) bool; others count nothing.
+      real: (L,) bool.
     """
     trust = jnp.where(real, jax.nn.softplus(run(point_trust(), params, keys)[:, 0]), 0.0)
-    return Queries(keys, keys, trust * config.landmarks / jnp.maximum(jnp.sum(real), 1))
+    return trust * config.landmarks / jnp.maximum(jnp.sum(real), 1)
 
 
 def place_landmarks(queries: Array, keys: Array, cloud: Cloud) -> Array:
@@ -127,14 +152,17 @@ def place_landmarks(queries: Array, keys: Array, cloud: Cloud) -> Array:
     Queries go through in blocks, so that a block's logits stay in a processor's cache however many pairs there are.
     """
     count = queries.shape[0]
-    blocks = jnp.pad(queries, ((0, -count % _BLOCK), (0, 0))).reshape(-1, _BLOCK, keys.shape[1])
-    return jax.lax.map(jax.checkpoint(lambda block: _place(block, keys, cloud)), blocks).reshape(-1, 3)[:count]
+    # Padding has the key of a real point, so that it changes no maximum, and adds nothing to what is summed.
+    keys = jnp.where(cloud.mask[:, None], keys, keys[jnp.argmax(cloud.mask)])
+    summed = jnp.where(cloud.mask[:, None], jnp.concatenate([cloud.points, jnp.ones_like(cloud.points[:, :1])], 1), 0.0)
+    blocks = jnp.pad(queries, ((0, -count % _BLOCK), (0, 0))).reshape(-(-count // _BLOCK), _BLOCK, keys.shape[1])
+    return jax.lax.map(jax.checkpoint(lambda block: _place(block, keys, summed)), blocks).reshape(-1, 3)[:count]
 
 
-def _place(queries: Array, keys: Array, cloud: Cloud) -> Array:
-    logits = jnp.where(cloud.mask, (queries / jnp.sqrt(keys.shape[1])) @ keys.T, -1e9)
+def _place(queries: Array, keys: Array, summed: Array) -> Array:
+    """Places (B, 3) of queries (B, c) among the points that ``summed`` (N, 4) holds, with a 1 each; 0 of none."""
+    logits = (queries / jnp.sqrt(keys.shape[1])) @ keys.T
     shares = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
     # A softmax, but its sums are made with those of the points: one passage over the matrix less.
-    summed = jnp.concatenate([cloud.points, jnp.ones_like(cloud.points[:, :1])], axis=1)
     places = jnp.matmul(shares, summed, precision=jax.lax.Precision.HIGHEST)
-    return places[:, :3] / places[:, 3:]
+    return places[:, :3] / jnp.where(places[:, 3:] > 0, places[:, 3:], 1.0)
