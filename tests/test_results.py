@@ -79,7 +79,10 @@ def test_reference_rows_on_every_12th_item_are_those_of_others():
     assert measured["fgr"]["mae_rotation"] == pytest.approx(0.233, abs=0.005)
 
 
-@pytest.mark.parametrize("name", ["benchmarks/speed.md", "summary.md", "trials/table.md", "ablation/table.md"])
+BENCHMARKS = ["benchmarks/speed.md", "benchmarks/stages.md"]
+
+
+@pytest.mark.parametrize("name", [*BENCHMARKS, "summary.md", "trials/table.md", "ablation/table.md"])
 def test_readme_shows_the_tables_that_were_written(name):
     for table in (EXPERIMENTS / name).read_text().strip().split("\n\n"):
         assert table in README

@@ -1,0 +1,172 @@
+"""Where the time of a batched `register` goes, stage by stage, and how near the hot loop is to what the machine can do.
+
+    python experiments/benchmarks/stages.py --data PATH
+
+Batches of 64 clean pairs of 1,024 points from the test split. Every stage is compiled and timed alone, on what the
+stages before it give, so that their sum and the whole differ a little. The hot loop, the placing of landmarks, compares
+every query with every key: its rate is set against that of one large product of matrices, and what it would move, were
+no logit kept in a cache, against that of a copy, both measured in the same run. Writes stages.json and stages.md beside
+this file.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from urrt_jax import ICP, load_model, register
+from urrt_jax.assessment import fit
+from urrt_jax.data import load_shapes
+from urrt_jax.evaluation import PROTOCOLS
+from urrt_jax.features.moments import moment_invariants
+from urrt_jax.geometry.clouds import make_cloud, normalize_pair, subsample
+from urrt_jax.geometry.normals import normals
+from urrt_jax.geometry.prepared import prepare
+from urrt_jax.model.consensus import align_landmarks, even_seeds
+from urrt_jax.model.encoding import encode_cloud
+from urrt_jax.model.landmarks import place_landmarks
+from urrt_jax.model.network import estimate
+from urrt_jax.refine import icp
+
+HERE = Path(__file__).parent
+BATCH = 64
+
+
+def milliseconds(function: Callable, *inputs: object, repeats: int = 7, batch: int = BATCH) -> float:
+    """The median time of a compiled function, a pair."""
+    run = jax.jit(function)
+    jax.block_until_ready(run(*inputs))
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(run(*inputs))
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times) / batch
+
+
+def measure(data: str) -> dict:
+    shapes = load_shapes(data, split="test", points=1024, limit=BATCH)
+    trials = [PROTOCOLS["dcp"](shapes.points, item) for item in range(BATCH)]
+    sources, targets = (
+        jnp.asarray(np.stack(each)) for each in list(zip(*(trial[:2] for trial in trials), strict=True))
+    )
+    model = load_model()
+    config, params = model.config, model.params
+
+    @jax.vmap
+    def ready(a, b):
+        source, target, _ = normalize_pair(make_cloud(a), make_cloud(b))
+        return prepare(source), prepare(target)
+
+    @jax.vmap
+    def smaller(pair):
+        return tuple(subsample(each.cloud, config.points) for each in pair)
+
+    @jax.vmap
+    def surroundings(pair):
+        return tuple(moment_invariants(each, config.octaves) for each in pair)
+
+    @jax.vmap
+    def encoding(cloud, invariants):
+        return encode_cloud(config, params, cloud, invariants)
+
+    @jax.vmap
+    def placing(queries, keys, cloud):
+        return place_landmarks(queries, keys, cloud)
+
+    @jax.vmap
+    def agreeing(here, there, weights):
+        seeds = even_seeds([here.shape[0] - 2 * config.lookups, config.lookups, config.lookups], config.hypotheses)
+        return align_landmarks(here, there, weights, rounds=config.consensus, seeds=seeds)
+
+    prepared = jax.jit(ready)(sources, targets)
+    small = jax.jit(smaller)(prepared)
+    invariants = jax.jit(surroundings)(small)
+    encoded = jax.jit(encoding)(small[0], invariants[0])
+    count = config.regions * config.landmarks + config.lookups
+    queries = config.sharpness * jnp.tile(encoded.keys, (1, 2, 1))[:, :count]
+    landmarks = jnp.tile(encoded.lookups.places, (1, 3, 1))[:, : count + config.lookups]
+    others = landmarks + 0.01 * jax.random.normal(jax.random.key(0), landmarks.shape)
+    estimated = jax.vmap(lambda source, target: estimate(model, source, target).transform)
+    answer = jax.jit(estimated)(*small)
+
+    def normal(pair):
+        return [normals(each.cloud.points, each.cloud, 3 * each.spacing, jnp.zeros(3)) for each in pair]
+
+    def refined(source, target, start, small):
+        return icp(source, target, start, ICP(), small=small)
+
+    place = milliseconds(placing, queries, encoded.keys, small[0])
+    stages = {
+        "normalise, spacing": milliseconds(ready, sources, targets),
+        "farthest points": milliseconds(smaller, prepared),
+        "surroundings of both clouds": milliseconds(surroundings, small),
+        "the network's steps": milliseconds(estimated, *small),
+        "– of a step: encode the source, its own lookups": milliseconds(encoding, small[0], invariants[0]),
+        "– of a step: place the other landmarks, in both clouds": 2 * place,
+        "– of a step: consensus": milliseconds(agreeing, landmarks, others, jnp.ones(landmarks.shape[:2])),
+        "refine": milliseconds(jax.vmap(refined), *prepared, answer, small),
+        "– normals of both clouds": milliseconds(jax.vmap(normal), prepared),
+        "assess": milliseconds(jax.vmap(fit), *prepared, answer),
+        "register": milliseconds(jax.vmap(lambda a, b: register(a, b, model=model)), sources, targets),
+    }
+    side = 2048
+    square = jnp.ones((side, side))
+    peak = 2 * side**3 / milliseconds(jnp.matmul, square, square, batch=1) / 1e6
+    # From and to memory that is warm: a copy in NumPy.
+    many, into = np.ones(2**25, np.float32), np.zeros(2**25, np.float32)
+    copies = []
+    for _ in range(5):
+        start = time.perf_counter()
+        np.copyto(into, many)
+        copies.append(time.perf_counter() - start)
+    copy = 2 * many.nbytes / statistics.median(copies) / 1e9
+    width = encoded.keys.shape[-1]
+    work = 2 * count * config.points * (width + 4) + count * config.points  # two products, and an exponential each
+    moved = 4 * 4 * count * config.points  # logits and shares, each written once and read once
+    return {
+        "command": f"python experiments/benchmarks/stages.py --data {Path(data).name}",
+        "cores": os.cpu_count(),
+        "device": jax.devices()[0].platform,
+        "jax": jax.__version__,
+        "batch": BATCH,
+        "milliseconds_a_pair": {name: round(value, 3) for name, value in stages.items()},
+        "hot_loop": {
+            "operations": work,
+            "gflops": round(work / place / 1e6, 1),
+            "gflops_of_a_large_product": round(peak, 1),
+            "bytes_if_nothing_stayed_in_a_cache": moved,
+            "gb_per_second": round(moved / place / 1e6, 1),
+            "gb_per_second_of_a_copy": round(copy, 1),
+        },
+    }
+
+
+def as_markdown(results: dict) -> str:
+    times, hot = results["milliseconds_a_pair"], results["hot_loop"]
+    lines = ["| stage | ms a pair | share |", "|---|---:|---:|"]
+    lines += [f"| {name} | {value:.2f} | {100 * value / times['register']:.0f} % |" for name, value in times.items()]
+    share = 100 * hot["gflops"] / hot["gflops_of_a_large_product"]
+    lines += [
+        "",
+        f"Placing landmarks: {hot['gflops']:.0f} GFLOP/s, {share:.0f} % of what one large product of matrices reaches "
+        f"({hot['gflops_of_a_large_product']:.0f}); were no logit kept in a cache, it would move "
+        f"{hot['gb_per_second']:.0f} GB/s, where a copy moves {hot['gb_per_second_of_a_copy']:.0f}.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt evaluate' takes it")
+    results = measure(parser.parse_args().data)
+    (HERE / "stages.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+    (HERE / "stages.md").write_text(as_markdown(results))
+    print(as_markdown(results))
