@@ -141,22 +141,24 @@ def side_by_side(batched: dict[str, Callable], batches: list, trials: list, repe
     ours = {f"{name}, batches of {BATCH}": function for name, function in batched.items()}
     for function in ours.values():
         jax.block_until_ready(function(*batches[0]))
-    times, poses = {name: [] for name in (*ours, *peers)}, {}
+    times: dict[str, list[float]] = {name: [] for name in (*ours, *peers)}
+    poses: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for _ in tqdm(range(repeats), desc="rounds"):
         for name, function in ours.items():
             start = time.perf_counter()
             found = jax.block_until_ready([function(*batch) for batch in batches])
             times[name].append(time.perf_counter() - start)
-            poses[name] = [np.concatenate([getattr(one, key) for one in found]) for key in ("rotation", "translation")]
+            rotations, translations = zip(*((one.rotation, one.translation) for one in found), strict=True)
+            poses[name] = np.concatenate(rotations), np.concatenate(translations)
         for name, peer in peers.items():
-            if poses.get(name) and name.startswith(PEERS["icp_starts"].title):
+            if name in poses and name.startswith(PEERS["icp_starts"].title):
                 continue  # many times slower than all others together: once is enough
             start = time.perf_counter()
             found = np.stack(
                 [peer.align_pair(each.source.astype(np.float64), each.target.astype(np.float64)) for each in trials]
             )
             times[name].append(time.perf_counter() - start)
-            poses[name] = [found[:, :3, :3], found[:, :3, 3]]
+            poses[name] = found[:, :3, :3], found[:, :3, 3]
     measured = [
         row(name, statistics.median(took) / len(trials), summarize(pose_errors(*poses[name], *truth))["recall_1deg"])
         for name, took in times.items()
