@@ -92,6 +92,15 @@ def test_landmarks_do_not_see_padding(place, cloud):
     np.testing.assert_array_equal(place(other, mask), place(cloud[:60], mask))
 
 
+def test_keys_of_padding_choose_nothing(cloud):
+    """However large: the largest logit, which all are compared with, is a real point's."""
+    queries, keys = (jax.random.normal(jax.random.key(k), (60, 8)) for k in (0, 1))
+    mask = np.arange(60) < 40
+    loud = jnp.where(mask[:, None], keys, 1e4 * keys)
+    found = [place_landmarks(queries, each, make_cloud(cloud[:60], mask)) for each in (keys, loud)]
+    np.testing.assert_array_equal(*found)
+
+
 def test_landmarks_move_with_points_whose_keys_stay(place, cloud, pose):
     mask = np.ones(60, bool)
     moved = place((cloud[:60] @ pose[0].T + pose[1]).astype(np.float32), mask)
