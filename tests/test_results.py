@@ -7,6 +7,7 @@ import pytest
 
 from urrt_jax import available_models, model_card
 from urrt_jax.evaluation import find_method
+from urrt_jax.geometry.neighbors import LARGE
 from urrt_jax.reproduce import as_markdown, find_experiment
 
 ROOT = Path(__file__).parents[1]
@@ -79,13 +80,22 @@ def test_reference_rows_on_every_12th_item_are_those_of_others():
     assert measured["fgr"]["mae_rotation"] == pytest.approx(0.233, abs=0.005)
 
 
-BENCHMARKS = ["benchmarks/speed.md", "benchmarks/stages.md"]
+BENCHMARKS = ["benchmarks/speed.md", "benchmarks/stages.md", "benchmarks/neighbors.md"]
 
 
 @pytest.mark.parametrize("name", [*BENCHMARKS, "summary.md", "trials/table.md", "ablation/table.md"])
 def test_readme_shows_the_tables_that_were_written(name):
     for table in (EXPERIMENTS / name).read_text().strip().split("\n\n"):
         assert table in README
+
+
+def test_neighbours_are_exact_and_the_way_in_use_is_the_fastest_of_those_in_jax():
+    rows = json.loads((EXPERIMENTS / "benchmarks/neighbors.json").read_text())["rows"]
+    assert [row["points"] for row in rows][-1] == 1_000_000
+    for row in rows:
+        times = {way: took for way, took in row["milliseconds"].items() if way != "SciPy"}
+        assert min(times, key=times.__getitem__) == ("point by point" if row["points"] <= LARGE else "blocks")
+        assert max(row["largest_error"].values()) < 1e-8
 
 
 def test_decoders_that_regress_the_pose_do_best_without_regions():
@@ -171,6 +181,13 @@ def test_refined_results_on_spoiled_pairs_keep_their_promise(name, protocol, mea
     refined = rows(name, protocol)["register"]["asymmetric"]
     assert refined["angle_mean"] <= mean
     assert refined["recall_5deg_0.1"] >= 0.99
+
+
+def test_refinement_is_exact_where_points_have_counterparts():
+    """Whatever is cropped or astray: half of all pairs to rounding, and the means better than OMNet's on its pairs."""
+    for protocol in ("incomplete", "incomplete_both", "outliers share=0.05", "outliers", "outliers share=0.2"):
+        assert rows("table2_noise", protocol)["register"]["angle_median"] < 1e-3
+    assert rows("table2_noise", "incomplete_both")["register"]["asymmetric"]["mae_rotation"] <= 0.339
 
 
 def test_clean_protocol_is_degenerate_as_the_readme_says():

@@ -6,7 +6,8 @@ Every trial trains one configuration with one change, for 300 steps of 16 pairs 
 the protocols of the tables, network alone, with every second shape held out of the training split; no test shape is
 looked at. What changes only in use is measured with the weights of the base. A trial takes some minutes of one core.
 Runs are kept in runs/ beside this file: an interrupted command continues where it stopped. Writes results.json and
-table.md beside this file, with the trials that are there.
+table.md beside this file, with the trials that are there. Once the base is trained, commands with other names may run
+beside each other.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from urrt_jax.atomic import write_atomically
 from urrt_jax.data import Shapes, load_shapes
 from urrt_jax.evaluation import evaluate
 from urrt_jax.evaluation.methods import Ours
@@ -108,7 +110,7 @@ def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
     method = Ours(model=model, refine=None)
     return {
         "trial": name,
-        "changes": TRIALS[name],
+        "changes": _as_json(TRIALS[name]),
         "errors": {
             protocol: evaluate(method, protocol, validation.points[::2], progress=False).summary()["mae_rotation"]
             for protocol in PROTOCOLS
@@ -127,6 +129,26 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _as_json(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def keep(row: dict[str, Any], data: str) -> list[dict[str, Any]]:
+    """Writes a trial's row beside those that are there, of the same base, and returns them all in order."""
+    written, base = HERE / "results.json", _as_json(dataclasses.asdict(BASE))
+    before = json.loads(written.read_text()) if written.exists() else {}
+    # Of another base or other data they would not compare. Read only now: commands may run side by side.
+    command = f"python experiments/trials/run.py --data {data}"
+    rows = before["rows"] if (before.get("base"), before.get("command")) == (base, command) else []
+    rows = {each["trial"]: each for each in rows if each["changes"] == _as_json(TRIALS.get(each["trial"]))}
+    rows[row["trial"]] = row
+    ordered = [rows[name] for name in TRIALS if name in rows]
+    results = {"command": command, "jax": jax.__version__, "base": base, "rows": ordered}
+    write_atomically(written, json.dumps(results, indent=1) + "\n")
+    write_atomically(HERE / "table.md", as_markdown(ordered))
+    return ordered
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
@@ -135,21 +157,7 @@ if __name__ == "__main__":
     if unknown := sorted(set(flags.only) - set(TRIALS)):
         parser.error(f"no trials {unknown}; there are {list(TRIALS)}")
     shapes, validation = load_shapes(flags.data, points=BASE.pairs.points).split_validation(0.05, BASE.seed)
-    written = HERE / "results.json"
-    before = json.loads(written.read_text()) if written.exists() else {"base": None, "rows": []}
-    base = json.loads(json.dumps(dataclasses.asdict(BASE)))
-    rows = {row["trial"]: row for row in before["rows"] if row["changes"] == TRIALS.get(row["trial"])}
-    rows = rows if before.get("base") == base else {}  # of another base they would not compare
-    ordered: list[dict[str, Any]] = []
     for name in flags.only:
-        rows[name] = run_trial(name, shapes, validation)
-        ordered = [rows[each] for each in TRIALS if each in rows]
-        results = {
-            "command": f"python experiments/trials/run.py --data {Path(flags.data).name}",
-            "jax": jax.__version__,
-            "base": base,
-            "rows": ordered,
-        }
-        written.write_text(json.dumps(results, indent=1) + "\n")
-        (HERE / "table.md").write_text(as_markdown(ordered))
-    print(as_markdown(ordered))
+        row = run_trial(name, shapes, validation)
+        jax.clear_caches()  # dozens of trials' programs would be too many for the compiler's memory
+        print(as_markdown(keep(row, Path(flags.data).name)))

@@ -1,6 +1,8 @@
 """Experiments: from a configuration to results, table and pictures; nothing is left out, nothing is done twice."""
 
+import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -137,6 +139,85 @@ def test_what_is_done_is_not_done_again(experiment, files, tmp_path, monkeypatch
     monkeypatch.setattr("urrt_jax.peers.simple.Identity.align_pair", lambda *pair: pytest.fail("aligned again"))
     monkeypatch.setattr("urrt_jax.evaluation.methods._register_all", lambda *pair: pytest.fail("registered again"))
     assert run(experiment, files, tmp_path / "out") == first
+
+
+@pytest.fixture
+def measured(experiment, files, tmp_path):
+    """An experiment of one part and one sweep, run, with a mark on the rows that can be kept; the items are gone."""
+    experiment = dataclasses.replace(experiment, parts=experiment.parts[:1])
+    results = run(experiment, files, tmp_path / "out")
+    for row in results["parts"][0]["rows"]:
+        row["mae_rotation"] = 123.0
+    results["sweeps"][0]["rows"][0]["title"] = "marked"
+    (tmp_path / "out" / "results.json").write_text(json.dumps(results))
+    shutil.rmtree(tmp_path / "items")
+    return experiment, tmp_path / "out"
+
+
+def test_only_some_methods_are_measured_anew(measured, files):
+    experiment, out = measured
+    results = run(experiment, files, out, only=["register"])
+    assert [row["mae_rotation"] == 123.0 for row in results["parts"][0]["rows"]] == [True, True, False]
+    assert results["sweeps"][0]["rows"][0]["title"] == "marked"
+    assert json.loads((out / "results.json").read_text()) == results
+
+
+def _other_settings(results):
+    results["parts"][0]["rows"][1]["identity"]["method"] = "another"
+
+
+def _other_data(results):
+    results["parts"][0]["data_digest"] = "0"
+
+
+def _no_row(results):
+    del results["parts"][0]["rows"][1]
+
+
+def _sweep_of_other_settings(results):
+    results["sweeps"][0]["rows"][0]["identity"]["method"] = "another"
+
+
+def _sweep_of_unknown_settings(results):
+    del results["sweeps"][0]["rows"][0]["identity"]
+
+
+def _sweep_of_other_data(results):
+    results["sweeps"][0]["data_digest"] = "0"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_other_settings, "'principal_axes' of 'clean' has other settings"),
+        (_other_data, "'identity' of 'clean' is not among"),
+        (_no_row, "'principal_axes' of 'clean' is not among"),
+        (_sweep_of_other_settings, "'identity' of 'noise' has other settings"),
+        (_sweep_of_unknown_settings, "'identity' of 'noise' has other settings"),
+        (_sweep_of_other_data, "'identity' of 'noise' is not among"),
+    ],
+)
+def test_rows_of_something_else_are_not_kept(measured, files, change, message):
+    experiment, out = measured
+    results = json.loads((out / "results.json").read_text())
+    change(results)
+    changed = json.dumps(results)
+    (out / "results.json").write_text(changed)
+    with pytest.raises(ValueError, match=f"^only: .*{message}"):
+        run(experiment, files, out, only=["register"])
+    assert (out / "results.json").read_text() == changed
+
+
+def test_only_names_methods_of_the_experiment_and_needs_earlier_results(experiment, files, tmp_path):
+    with pytest.raises(ValueError, match=r"^only: expected some of identity, principal_axes, register, got icp"):
+        run(experiment, files, tmp_path / "out", only=["icp"])
+    with pytest.raises(ValueError, match=r"^only: expected some of .*, got none"):
+        run(experiment, files, tmp_path / "out", only=[])
+    with pytest.raises(FileNotFoundError, match=r"results\.json"):
+        run(experiment, files, tmp_path / "nothing", only=["register"])
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"^only: .*results\.json holds no table"):
+        run(experiment, files, tmp_path, only=["register"])
 
 
 def test_other_weights_are_evaluated_anew(experiment, files, tmp_path, small_model):

@@ -22,6 +22,8 @@ class Reproduce:
             'procedural'. Tables beyond the paper look for bunny_scans.npz and a set of 2,048 points a shape in it.
         out: Folder to write; by default reproduced/TABLE.
         limit: At most so many items of each protocol, evenly spread.
+        only: Methods to measure anew, by their names in the config.toml; the rows of the others are taken from the
+            results in --out, which must be of the same code.
         model: Ours: name of a packaged model, or a file written by 'urrt train'.
     """
 
@@ -29,6 +31,7 @@ class Reproduce:
     data: str | None = None
     out: Path | None = None
     limit: int | None = None
+    only: tuple[str, ...] | None = None
     model: str = "modelnet40"
 
     def run(self) -> int:
@@ -44,11 +47,16 @@ class Reproduce:
             flags += ["--out", self.out.as_posix() if not self.out.is_absolute() else self.out.name]
         flags += [] if self.limit is None else ["--limit", str(self.limit)]
         flags += [] if self.model == "modelnet40" else ["--model", Path(self.model).name]
-        run = draw_pairs if experiment.kind == "pictures" else reproduce
-        run(
-            experiment, data, out,
-            model=self.model, limit=self.limit, command=shlex.join(flags), report=print,
-        )  # fmt: skip
+        command = shlex.join(flags)
+        if experiment.kind == "table":
+            reproduce(
+                experiment, data, out,
+                model=self.model, limit=self.limit, only=self.only, command=command, report=print,
+            )  # fmt: skip
+        elif self.only is not None:
+            raise ValueError(f"--only: {experiment.name} is drawn as a whole")
+        else:
+            draw_pairs(experiment, data, out, model=self.model, limit=self.limit, command=command, report=print)
         if experiment.kind == "table":
             print((out / "table.md").read_text())
         drawn = "figure.png" if experiment.kind == "pictures" else "table.md and figures"

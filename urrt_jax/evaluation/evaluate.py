@@ -216,7 +216,9 @@ def data_digest(data: Any) -> str:
     """A short digest of the values of shapes (S, P, 3) or scans, so that results are never mixed up."""
     state = hashlib.sha256()
     for each in [data] if isinstance(data, np.ndarray) else [array for trial in data for array in trial[:4]]:
-        state.update(np.ascontiguousarray(each).tobytes())
+        # The poses of scans are computed: machines may round them differently. Adding 0 leaves no negative zero.
+        values = each if isinstance(data, np.ndarray) else np.round(np.asarray(each, np.float64), 6) + 0.0
+        state.update(np.ascontiguousarray(values).tobytes())
     return state.hexdigest()[:16]
 
 

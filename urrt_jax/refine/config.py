@@ -18,14 +18,15 @@ class ICP:
       points: points of each cloud that look for their neighbour in all of the other one, in the second stage.
       iterations: its iterations at most.
       inlier_distance: the second stage's weights fall to a quarter at this many spacings of the coarser cloud, after
-        they have shrunk from the first stage's spacing.
+        they have shrunk from the first stage's spacing; at less, down to a twentieth of it, where the pairs that count
+        turn out to lie closer.
       plane: 1 measures distances to the neighbour's tangent plane, 0 to the neighbour; between them both count. Planes
         let samples of one surface slide on each other; points hold where planes don't.
       normal_radius: of the neighbourhood of a normal, in spacings.
       mutual: only pairs count that are each other's nearest, as far as the chosen points go.
       trim: only the nearest pairs count, as many as the overlap is estimated to hold.
       tolerance: a stage has converged when a step turns by less than this (radians) and moves by less than this share
-        of the clouds' radius.
+        of the clouds' radius, and its weights hardly narrow any more.
     """
 
     coarse_points: int = 256

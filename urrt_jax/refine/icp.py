@@ -2,7 +2,9 @@
 
 Stage one looks for the basin on small even subsamples, point to point (Besl and McKay 1992). Stage two makes it exact:
 pairs from both directions, distances along normals as well as between points. Both weigh pairs by Geman and McClure's
-function, whose width shrinks step by step (as in Zhou et al. 2016).
+function, whose width shrinks step by step (as in Zhou et al. 2016): in stage two to the spacing, and from there to what
+the pairs that count say of their own distances. Where points have their counterparts, that is next to nothing, and
+those without do not pull.
 """
 
 import math
@@ -24,6 +26,9 @@ from urrt_jax.refine.pairs import Surface, find_pairs, pair_up, robust_weights, 
 from urrt_jax.refine.step import bounded_step, damped_solve, move, normal_equations
 
 _SHRINK, _SHRINK_FINE = 0.8, 0.7
+_SPREADS = 2.0  # the last reach, in root mean square distances of the pairs that count
+_NARROWEST = 0.05  # the last reach at least, in inlier distances
+_STEADY, _STEADY_SHARE = 20.0, 1000.0  # by how much it may still change: tolerances, and as many inlier distances each
 _NORMAL_POINTS = 4096  # of a large cloud, that normals are made from
 _SEEN = 5.0  # pairs farther apart than this many reaches weigh less than 0.0015 and are not looked for
 
@@ -137,31 +142,43 @@ def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, co
         paired = jnp.sum(weights > 0) >= 3
         motion = jnp.where(paired, bounded_step(*normal_equations(pairs, weights, config.plane)), 0.0)
         still = (jnp.linalg.norm(motion[:3]) < config.tolerance) & (jnp.linalg.norm(motion[3:]) < config.tolerance)
-        settled = paired & still & (now.reach <= floor)
-        reach = jnp.maximum(now.reach * _SHRINK_FINE, floor)
-        return _Progress(move(motion, now.transform), reach, settled, now.iteration + 1)
+        narrow = jnp.sqrt(_squared_reach(pairs.squared, weights, floor))
+        reach = jnp.where(now.reach <= floor, narrow, jnp.maximum(now.reach * _SHRINK_FINE, floor))
+        change = jnp.abs(reach - now.reach)
+        steady = (now.reach <= floor) & (change < config.tolerance * jnp.minimum(_STEADY, _STEADY_SHARE * floor))
+        return _Progress(move(motion, now.transform), reach, paired & still & steady, now.iteration + 1)
 
     start = _Progress(initial, jnp.maximum(reach, jax.lax.stop_gradient(floor)), jnp.array(False), jnp.array(0))
     end = while_each(unfinished, step, start, (*loose, jax.lax.stop_gradient(floor)))
 
     pairs = find_pairs(*loose, end.transform, _SEEN * end.reach, mutual=config.mutual)
     counted = weigh(pairs.squared, end.reach) > 0
-    reach = end.reach * (floor / jax.lax.stop_gradient(floor))  # the spacing moves with the points
 
-    def gradient(motion: Array) -> Array:
+    def imbalance(rest: Array) -> Array:
+        motion, growth = rest[:6], rest[6]
         here = pair_up(*surfaces, move(motion, end.transform), pairs.rows)
-        weights = robust_weights(jnp.where(counted, here.squared, jnp.inf), reach)
-        return normal_equations(here, weights, config.plane)[1]
+        squared = jnp.where(counted, here.squared, jnp.inf)
+        weights = robust_weights(squared, end.reach * jnp.exp(growth))
+        too_wide = growth + jnp.log(end.reach) - 0.5 * jnp.log(_squared_reach(squared, weights, floor))
+        # Both as large as the number of pairs that count: one damping suits them.
+        return jnp.append(normal_equations(here, weights, config.plane)[1], jnp.sum(counted) * too_wide)
 
-    # The end is where this gradient vanishes; how that place moves with the points is all that derivatives need.
+    # The end is where this vanishes; how that place moves with the points is all that derivatives need.
     rest = jax.lax.custom_root(
-        gradient,
+        imbalance,
         # Depends on the pair: custom_root's guess must be batched with it.
-        jnp.where(end.settled, jnp.zeros(6, floor.dtype), 0.0),
-        solve=lambda _, motion: motion,
+        jnp.where(end.settled, jnp.zeros(7, floor.dtype), 0.0),
+        solve=lambda _, rest: rest,
         tangent_solve=lambda linear, value: damped_solve(jax.jacobian(linear)(value), value),
     )
-    return Refinement(move(rest, end.transform), end.settled, end.iteration)
+    return Refinement(move(rest[:6], end.transform), end.settled, end.iteration)
+
+
+def _squared_reach(squared: Array, weights: Array, widest: Array) -> Array:
+    """The squared reach, (), that the pairs' squared distances (P,) ask for under these weights; never 0."""
+    distances = jnp.where(weights > 0, squared, 0.0)  # infinite, where a pair is none
+    mean = jnp.sum(weights * distances) / jnp.maximum(jnp.sum(weights), 1e-9)
+    return jnp.clip(_SPREADS**2 * mean, (_NARROWEST * widest) ** 2, widest**2)
 
 
 def _surface(cloud: Prepared, config: ICP) -> Surface:

@@ -42,9 +42,9 @@ def normal_equations(pairs: Pairs, weights: Array, plane: float) -> tuple[Array,
 
 
 def damped_solve(matrix: Array, vector: Array) -> Array:
-    """The solution (6,) of a linear system whose matrix (6, 6) may be singular, as degenerate clouds make it."""
-    damping = _DAMPING * jnp.trace(jnp.abs(matrix)) / 6 + _LEAST_DAMPING
-    return jnp.linalg.solve(matrix + damping * jnp.eye(6, dtype=matrix.dtype), vector)
+    """The solution (D,) of a linear system whose matrix (D, D) may be singular, as degenerate clouds make it."""
+    damping = _DAMPING * jnp.mean(jnp.abs(jnp.diagonal(matrix))) + _LEAST_DAMPING
+    return jnp.linalg.solve(matrix + damping * jnp.eye(len(vector), dtype=matrix.dtype), vector)
 
 
 def bounded_step(matrix: Array, gradient: Array) -> Array:

@@ -6,7 +6,7 @@ import os
 import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -46,6 +46,7 @@ def reproduce(
     *,
     model: str = "modelnet40",
     limit: int | None = None,
+    only: Sequence[str] | None = None,
     command: str = "",
     progress: bool = True,
     report: Callable[[str], None] = lambda line: None,
@@ -62,16 +63,19 @@ def reproduce(
       out: the folder to write.
       model: ours: a packaged name or a file.
       limit: at most so many items a part, evenly spread; all by default.
+      only: methods to measure; the rows of the others are taken from the results in ``out``, which must be of the same
+        items, methods and settings. All by default.
       command: recorded in the results.
       progress: whether progress bars are shown.
       report: called with a line for every part.
 
     Raises:
-      ValueError, OSError: the data, the model or the limit can't be used.
+      ValueError, OSError: the data, the model or the limit can't be used, ``only`` is empty or names what is no method
+        of the experiment, or another method's row is not among the results in ``out`` as it would be measured today.
       ImportError: Matplotlib is not installed.
     """
     check_drawing()
-    runner = _Runner(data, out.parent / "items", model, limit, progress)
+    runner = _Runner(data, out.parent / "items", model, limit, progress, _earlier_rows(experiment, out, only))
     results: dict[str, Any] = results_header(experiment, data, model, command) | {
         "device": jax.devices()[0].platform,
         "processor": f"{os.cpu_count()} cores, {platform.processor() or platform.machine()}",
@@ -82,6 +86,7 @@ def reproduce(
         "not_built": list(experiment.not_built),
         "thresholds": THRESHOLDS.tolist(),
         "trend_bins": {name: list(edges) for name, edges in TREND_BINS.items()},
+        "measured_anew": None if only is None else sorted(only),
         "parts": [],
         "sweeps": [],
     }
@@ -104,14 +109,49 @@ def reproduce(
     return results
 
 
+class _Earlier(NamedTuple):
+    """The parts and sweeps of earlier results, and the methods whose rows are not taken from them."""
+
+    sections: list[dict[str, Any]]
+    anew: frozenset[str]
+
+
+_SAME = (
+    "title",
+    "protocol",
+    "option",
+    "values",
+    "data_digest",
+    "items",
+    "subset",
+)  # of sections whose rows can be kept
+
+
+def _earlier_rows(experiment: Experiment, out: Path, only: Sequence[str] | None) -> _Earlier | None:
+    if only is None:
+        return None
+    sections = (*experiment.parts, *experiment.sweeps)
+    known = {*experiment.methods, *(name for section in sections for name in section.methods or ())}
+    unknown = sorted(set(only) - known)
+    if unknown or not only:
+        raise ValueError(f"only: expected some of {', '.join(sorted(known))}, got {', '.join(unknown) or 'none'}")
+    earlier = json.loads((out / "results.json").read_text())
+    if earlier.get("thresholds") != THRESHOLDS.tolist():
+        raise ValueError(f"only: {out / 'results.json'} holds no table, or one of other thresholds; measure all")
+    return _Earlier([*earlier["parts"], *earlier["sweeps"]], frozenset(only))
+
+
 class _Runner:
     """The data and the folder of saved values of one reproduction."""
 
-    def __init__(self, data: str, items: Path, model: str, limit: int | None, progress: bool) -> None:
+    def __init__(
+        self, data: str, items: Path, model: str, limit: int | None, progress: bool, earlier: _Earlier | None
+    ) -> None:
         spread(1, limit)
         if data != "procedural" and not Path(data).exists():  # mistyped: an error, not a row
             raise FileNotFoundError(f"{data}: no such file or folder (nor is it the word 'procedural')")
         self.data, self.folder, self.model, self.limit, self.progress = data, items, model, limit, progress
+        self.earlier = earlier
         self._loaded: dict[tuple, tuple[Any, np.ndarray, list[dict], str]] = {}
 
     def part(self, part: Part, methods: Sequence[str], *, trends: bool) -> dict[str, Any]:
@@ -123,30 +163,61 @@ class _Runner:
         try:
             data, symmetric, about, source = self._load(part)
         except (ValueError, OSError) as error:
-            if part.data is None and not part.unseen:
+            if self.earlier is not None or (part.data is None and not part.unseen):
                 raise
             rows = [{"method": name, "title": self._find(name).title, "missing": "no data"} for name in methods]
             return result | {"items": 0, "subset": "", "missing": self._no_data(error), "data": None, "rows": rows}
         result |= {"data": source, "data_digest": data_digest(data)}
         items, subset = self._items(len(data), part.stride)
-        rows = [self._row(name, part.protocol, data, items, symmetric, about, trends=trends) for name in methods]
-        return result | {"items": len(items), "subset": subset, "rows": rows}
+        result |= {"items": len(items), "subset": subset}
+        rows = [
+            self._kept(name, result) or self._row(name, part.protocol, data, items, symmetric, about, trends=trends)
+            for name in methods
+        ]
+        return result | {"rows": rows}
 
     def sweep(self, sweep: Sweep, methods: Sequence[str]) -> dict[str, Any]:
         """The results of one sweep: the median and the 5° recall of each method at each value."""
-        result: dict[str, Any] = {"title": sweep.title, "protocol": sweep.protocol, "values": list(sweep.values)}
         part = Part(title="", protocol=sweep.protocol, points=sweep.points)
         data, symmetric, about, _ = self._load(part)
+        result: dict[str, Any] = {
+            "title": sweep.title, "protocol": sweep.protocol, "option": sweep.option, "values": list(sweep.values),
+            "data_digest": data_digest(data),
+        }  # fmt: skip
         items, subset = self._items(len(data), sweep.stride)
+        result |= {"items": len(items), "subset": subset}
         rows = []
         for name in methods:
+            if kept := self._kept(name, result):
+                rows.append(kept)
+                continue
             points = [self._row(name, each, data, items, symmetric, about) for each in sweep.protocols()]
             if "missing" in points[0]:
                 rows.append(points[0])
                 continue
             lines = {key: [point[key] for point in points] for key in ("angle_median", "recall_5deg_0.1")}
-            rows.append({"method": name, "title": points[0]["title"], **lines})
-        return result | {"items": len(items), "subset": subset, "rows": rows}
+            rows.append({"method": name, "title": points[0]["title"], **lines, "identity": points[0]["identity"]})
+        return result | {"rows": rows}
+
+    def _kept(self, name: str, result: dict[str, Any]) -> dict[str, Any] | None:
+        """The row of a method that is not to be measured, of earlier results of the same part or sweep."""
+        if self.earlier is None or name in self.earlier.anew:
+            return None
+        found = [each for each in self.earlier.sections if all(each.get(key) == result.get(key) for key in _SAME)]
+        rows = [row for each in found for row in each["rows"] if row["method"] == name]
+        if not rows:
+            raise ValueError(
+                f"only: the row {name!r} of {result['title']!r} is not among the earlier results of the same items; "
+                "measure it, too"
+            )
+        row = rows[0]
+        try:
+            identity = json.loads(json.dumps(self._find(name).identity()))
+        except ImportError:  # what it would be today can't be known here
+            return row
+        if row.get("identity") != identity:  # a missing row has none
+            raise ValueError(f"only: the earlier {name!r} of {result['title']!r} has other settings; measure it, too")
+        return row
 
     def _no_data(self, error: Exception) -> str:
         # Results are for other people, too: names only.
