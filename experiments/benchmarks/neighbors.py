@@ -16,8 +16,6 @@ import importlib
 import importlib.metadata
 import json
 import os
-import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from timing import median_seconds
 from tqdm import tqdm
 
 from urrt_jax.data import demo_shape
@@ -77,16 +76,6 @@ def clouds(size: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return points[::2] @ turn.T, points[1::2]
 
 
-def timed(function: Callable[[], object], repeats: int) -> float:
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
-
-
 def measure(size: int, repeats: int) -> dict:
     batch = BATCH if size <= LARGE else 1
     pairs = [clouds(size, seed) for seed in range(batch)]
@@ -102,9 +91,9 @@ def measure(size: int, repeats: int) -> dict:
         except ImportError:
             continue
         row["largest_error"][name] = float(np.max(np.abs(np.sqrt(found) - np.sqrt(truth))))
-        took = timed(lambda run=run: jax.block_until_ready(run(query, points)), repeats)
+        took = median_seconds(lambda run=run: jax.block_until_ready(run(query, points)), repeats)
         row["milliseconds"][name] = 1e3 * took / batch
-    took = timed(lambda: [KDTree(there).query(here, workers=-1) for here, there in pairs], repeats)
+    took = median_seconds(lambda: [KDTree(there).query(here, workers=-1) for here, there in pairs], repeats)
     row["milliseconds"]["SciPy"] = 1e3 * took / batch
     return row
 

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
+from timing import median_seconds
 from tqdm import tqdm
 
 from urrt_jax import Search, load_model, model_card, pad_clouds, register
@@ -43,16 +44,6 @@ PEERS_TIMED = ("icp", "gicp", "fgr", "fgr_icp", "icp_starts")
 SCANS = "bunny_scans.npz"
 SCAN_PEERS_TIMED = ("scan_ransac", "scan_kiss")
 SCAN_PAIRS = 12
-
-
-def seconds(function: Callable[[], object], repeats: int) -> float:
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def command_line_seconds() -> dict[str, float]:
@@ -83,7 +74,7 @@ def measure_large(size: int) -> dict:
     cloud = demo_shape(2 * size)
     turn = Rotation.from_euler("zyx", [10, 20, 30], degrees=True).as_matrix()
     pair = jnp.asarray(cloud[::2]), jnp.asarray((cloud[1::2] @ turn.T + 0.1).astype(np.float32))
-    took = seconds(lambda: jax.block_until_ready(register(pair[0], pair[1])), 1)
+    took = median_seconds(lambda: jax.block_until_ready(register(pair[0], pair[1])), 1)
     # Not ru_maxrss: a child inherits that from the process that started it.
     peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return {"seconds": took, "peak_gib": int(peak.split()[1]) / 2**20}

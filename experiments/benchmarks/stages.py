@@ -20,6 +20,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import median_seconds
 
 from urrt_jax import ICP, load_model, register
 from urrt_jax.assessment import fit
@@ -42,13 +43,7 @@ BATCH = 64
 def milliseconds(function: Callable, *inputs: object, repeats: int = 7, batch: int = BATCH) -> float:
     """The median time of a compiled function, a pair."""
     run = jax.jit(function)
-    jax.block_until_ready(run(*inputs))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(run(*inputs))
-        times.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(times) / batch
+    return 1e3 * median_seconds(lambda: jax.block_until_ready(run(*inputs)), repeats) / batch
 
 
 def measure(data: str) -> dict:

@@ -53,12 +53,12 @@ class Reproduce:
                 experiment, data, out,
                 model=self.model, limit=self.limit, only=self.only, command=command, report=print,
             )  # fmt: skip
-        elif self.only is not None:
-            raise ValueError(f"--only: {experiment.name} is drawn as a whole")
-        else:
-            draw_pairs(experiment, data, out, model=self.model, limit=self.limit, command=command, report=print)
-        if experiment.kind == "table":
             print((out / "table.md").read_text())
-        drawn = "figure.png" if experiment.kind == "pictures" else "table.md and figures"
+            drawn = "table.md and figures"
+        else:
+            if self.only is not None:
+                raise ValueError(f"--only: {experiment.name} is drawn as a whole")
+            draw_pairs(experiment, data, out, model=self.model, limit=self.limit, command=command, report=print)
+            drawn = "figure.png"
         print(f"wrote results.json and {drawn} to {out}")
         return 0

@@ -116,15 +116,8 @@ class _Earlier(NamedTuple):
     anew: frozenset[str]
 
 
-_SAME = (
-    "title",
-    "protocol",
-    "option",
-    "values",
-    "data_digest",
-    "items",
-    "subset",
-)  # of sections whose rows can be kept
+# What parts and sweeps have in common whose rows can be kept.
+_SAME = ("title", "protocol", "option", "values", "data_digest", "items", "subset")
 
 
 def _earlier_rows(experiment: Experiment, out: Path, only: Sequence[str] | None) -> _Earlier | None:
