@@ -294,25 +294,24 @@ def apart(cloud) -> np.ndarray:
     return kept
 
 
-@pytest.mark.parametrize("part", ["rotation", "translation"])
 @pytest.mark.parametrize("moves", ["source", "target"])
-def test_refined_pose_derivative_agrees_with_finite_differences(small_model, apart, pose, part, moves):
+def test_refined_pose_derivative_agrees_with_finite_differences(small_model, apart, pose, moves):
     """Noise on the target, so that the fit is not perfect; the points lie so far apart that correspondences hold."""
     rng = np.random.default_rng(0)
-    noisy = apart @ pose[0].T + pose[1] + 0.004 * rng.normal(size=apart.shape)
+    noisy = apart @ pose[0].T + pose[1] + 0.01 * rng.normal(size=apart.shape)
     points = {"source": jnp.asarray(apart), "target": jnp.asarray(noisy, jnp.float32)}
     along = jnp.asarray(rng.normal(size=apart.shape), jnp.float32)
-    weights = jnp.asarray(rng.normal(size=(3, 3) if part == "rotation" else 3), jnp.float32)
+    turning, shifting = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(3, 3), (3,)])
     exact = ICP(plane=0.0, tolerance=3e-7)  # normals change when a neighbourhood does; tests/refine has them
 
     @jax.jit
-    def value(step):
+    def values(step):
         result = register(**(points | {moves: points[moves] + step * along}), model=small_model, refine=exact)
-        return jnp.sum(getattr(result, part) * weights)
+        return jnp.stack([jnp.sum(result.rotation * turning), jnp.sum(result.translation * shifting)])
 
-    step = 3e-3
-    difference = float(value(step) - value(-step)) / (2 * step)
-    assert float(jax.grad(value)(0.0)) == pytest.approx(difference, rel=0.05, abs=5e-3)
+    step = 1e-4  # little against the noise, which the width of the weights follows
+    difference = (values(step) - values(-step)) / (2 * step)
+    np.testing.assert_allclose(jax.jacrev(values)(0.0), difference, rtol=0.02, atol=5e-3)
 
 
 def test_derivative_of_the_translation_follows_a_moved_cloud(small_model, cloud, target):
