@@ -148,9 +148,12 @@ def quick_rotation(moment: Array) -> Array:
     turn = jnp.stack([moment[2, 1] - moment[1, 2], moment[0, 2] - moment[2, 0], moment[1, 0] - moment[0, 1]])
     power = jnp.block([[trace, turn], [turn[:, None], symmetric - trace * jnp.eye(3)]])
     power = power + 2 * jnp.eye(4)  # eigenvalues are within √3 of zero: the first becomes the largest in size
-    for _ in range(9):
+
+    def square(_: int, power: Array) -> Array:
         power = jnp.sum(power[:, :, None] * power[None], axis=1)
-        power = power / jnp.trace(power)
+        return power / jnp.trace(power)
+
+    power = jax.lax.fori_loop(0, 9, square, power)
     # Every column tends to a multiple of the eigenvector; the longest one is never zero.
     column = power[:, jnp.argmax(jnp.diagonal(power))]
     w, x, y, z = column / jnp.sqrt(jnp.sum(column**2))

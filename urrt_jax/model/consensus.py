@@ -126,11 +126,11 @@ def _best_hypothesis(source: Array, target: Array, landmarks: _Landmarks, given:
     # Against their own mean, however little speaks for a hypothesis; what is as good as nothing stays nothing.
     mean = jax.lax.stop_gradient(jnp.matmul(backed, given / jnp.maximum(jnp.sum(given), 1.0)))
     start = given * (backed / jnp.maximum(mean, _NOTHING)[:, None]) ** 2
+    start = jnp.concatenate([given[None], start])
     # Which one is best is a choice, and has no derivative; what the best one says has.
     fixed, trusted, tried = jax.lax.stop_gradient((landmarks, given, start))
     gains = jax.vmap(lambda weights: _gain(fixed, trusted, weights))(tried)
-    best = jnp.argmax(gains)
-    return jnp.where(gains[best] > _gain(fixed, trusted, trusted), start[best], given)
+    return start[jnp.argmax(gains)]
 
 
 def _gain(landmarks: _Landmarks, given: Array, weights: Array) -> Array:
