@@ -342,6 +342,18 @@ def test_reproduce_writes_a_table_of_ones_own(files, capsys, tmp_path):
     assert [row["method"] for row in results["parts"][0]["rows"]] == ["identity", "register"]
     assert str(tmp_path) not in json.dumps(results)
 
+    kept, anew = results["parts"][0]["rows"]
+    anew["mae_rotation"] = kept["mae_rotation"] = 123.0
+    (tmp_path / "out" / "results.json").write_text(json.dumps(results))
+    assert cli.main(["reproduce", str(own), *flags, "--only", "register"]) == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [row["mae_rotation"] == 123.0 for row in results["parts"][0]["rows"]] == [True, False]
+
+
+def test_reproduce_draws_pictures_as_a_whole(capsys):
+    assert cli.main(["reproduce", "figure4", "--only", "register"]) == 2
+    assert "--only: figure4_qualitative is drawn as a whole" in capsys.readouterr().err
+
 
 def test_reproduce_refuses_an_unknown_table(capsys):
     assert cli.main(["reproduce", "table9"]) == 2

@@ -43,9 +43,9 @@ def _padded(points: np.ndarray, rows: int = _ROWS) -> Cloud:
     return make_cloud(jnp.asarray(values, jnp.result_type(float)), np.arange(rows) < len(points))
 
 
-def refine(source: np.ndarray, target: np.ndarray, config: ICP = ICP()) -> tuple[float, bool]:
+def refine(source: np.ndarray, target: np.ndarray, config: ICP = ICP(), *, rows: int = _ROWS) -> tuple[float, bool]:
     """The rotation error in degrees against TURN, from the identity, and whether it converged."""
-    source_cloud, target_cloud, _ = _normalize_pair(_padded(source), _padded(target))
+    source_cloud, target_cloud, _ = _normalize_pair(_padded(source, rows), _padded(target, rows))
     result = _icp(source_cloud, target_cloud, rigid.identity(), config)
     return float(rotation_degrees(result.transform.rotation, TURN)), bool(result.converged)
 
@@ -90,6 +90,15 @@ def test_what_has_no_counterpart_does_not_pull(surface):
         error, converged = refine(source, target @ TURN.T)
         assert error < 1e-3
         assert converged
+
+
+def test_what_has_no_counterpart_does_not_pull_in_dense_clouds():
+    """Of which some points ask and blocks answer, and whose spacing is a small share of their size."""
+    dense, random = _surface(9000), np.random.default_rng(0)
+    source, target = (dense[random.random(9000) < 0.7] for _ in range(2))
+    error, converged = refine(source, target @ TURN.T, rows=6600)
+    assert error < 1e-4
+    assert converged
 
 
 def test_the_reach_stays_where_nothing_coincides():

@@ -14,7 +14,7 @@ from urrt_jax.geometry.clouds import Cloud
 from urrt_jax.geometry.curve import curve_order
 
 _MANY = 200_000  # from here on, fewer and larger blocks: each tile looks at all their boxes
-_TILE = 128  # queries that walk together
+_TILE = 64  # queries that walk together
 _UNROLL = 16
 
 
