@@ -130,7 +130,8 @@ def _best_hypothesis(source: Array, target: Array, landmarks: _Landmarks, given:
     # Which one is best is a choice, and has no derivative; what the best one says has.
     fixed, trusted, tried = jax.lax.stop_gradient((landmarks, given, start))
     gains = jax.vmap(lambda weights: _gain(fixed, trusted, weights))(tried)
-    return start[jnp.argmax(gains)]
+    # A gain that is no number beats nothing, and the given weights win a tie.
+    return start[jnp.argmax(jnp.where(gains > gains[0], gains, gains[0]))]
 
 
 def _gain(landmarks: _Landmarks, given: Array, weights: Array) -> Array:
