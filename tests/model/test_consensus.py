@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from urrt_jax.geometry import rigid
-from urrt_jax.model.consensus import align_landmarks, even_seeds
+from urrt_jax.model.consensus import align_landmarks, even_seeds, hypotheses
 
 
 @functools.partial(jax.jit, static_argnames=("rounds", "hypotheses"))
@@ -187,3 +187,45 @@ def test_few_landmarks_are_all_seeds():
 @pytest.mark.parametrize("groups", [[], [0, 0], [7]])
 def test_no_seeds(groups):
     assert len(even_seeds(groups or [0], 0)) == 0
+
+
+_every = np.arange(20)
+_say = jax.jit(lambda source, target, weights: hypotheses(source, target, weights, _every))
+
+
+def test_every_hypothesis_of_matching_landmarks_is_their_motion(pose):
+    source = _landmarks()
+    found = _say(source, source @ pose[0].T + pose[1], _weights())
+    _close(found, jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (20, *leaf.shape)), rigid.Rigid(*pose)), atol=1e-3)
+
+
+def test_two_motions_at_once_have_a_hypothesis_each(pose):
+    """Consensus has to choose; hypotheses leave the choice to others."""
+    source, truth = _landmarks(), jnp.asarray(pose[0], jnp.float32)
+    other = jnp.asarray(Rotation.from_rotvec([0.4, -1.5, 1.0]).as_matrix(), jnp.float32)
+    target = jnp.concatenate([source[:10] @ truth.T, source[10:] @ other.T + 0.3])
+    rotations = _say(source, target, _weights()).rotation
+    for rows, expected in ((slice(0, 10), truth), (slice(10, 20), other)):
+        errors = jax.vmap(lambda rotation, expected=expected: rigid.rotation_angle(rotation, expected))(rotations[rows])
+        assert float(jnp.min(errors)) < 1e-2
+        assert float(jnp.median(errors)) < 0.1
+
+
+def test_swapped_clouds_have_the_inverse_hypotheses(pose):
+    source = _landmarks()
+    target = source @ pose[0].T + pose[1] + 0.05 * _landmarks(7)
+    back = jax.vmap(rigid.inverse)(_say(target, source, _weights()))
+    _close(back, _say(source, target, _weights()), atol=1e-4)
+
+
+@pytest.mark.parametrize("weights", [np.zeros(20), np.eye(20)[3]], ids=["none", "of one landmark"])
+def test_hypotheses_without_weight_are_rigid(weights):
+    found = _say(_landmarks(1), _landmarks(2), jnp.asarray(weights, jnp.float32))
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in found)
+    turned = jnp.einsum("sij,skj->sik", found.rotation, found.rotation)
+    np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-4)
+
+
+def test_without_seeds_there_are_no_hypotheses():
+    found = hypotheses(_landmarks(1), _landmarks(2), _weights(), np.zeros(0, int))
+    assert found.rotation.shape == (0, 3, 3)

@@ -15,7 +15,7 @@ from urrt_jax.geometry.clouds import make_cloud, normalize_pair
 from urrt_jax.model import Model, ModelConfig, estimate, init_model
 from urrt_jax.model.attention import attention_weights
 from urrt_jax.model.encoder import shape_embedding
-from urrt_jax.model.network import encode, point_regions, predict
+from urrt_jax.model.network import encode, point_regions, predict, propose
 from urrt_jax.model.partition import (
     branch_logits,
     occupancy_logits,
@@ -54,6 +54,19 @@ def pair(cloud, pose):
     """Two clouds of 60 points, fewer than the network's size, the second one posed."""
     target = cloud[100:160] @ pose[0].T + pose[1]
     return cloud[:60].astype(np.float64), target.astype(np.float64)
+
+
+def test_aligned_clouds_are_proposed_to_stay(model, pair, x64):
+    """Decoders that regress the pose propose what they estimate in one step."""
+    cloud = make_cloud(pair[0] - pair[0].mean(axis=0))
+    proposed = jax.jit(propose, static_argnums=3)(model, cloud, cloud, 8)
+    expected = rigid.identity()
+    if model.config.decoder == "pose":
+        once = dataclasses.replace(model, config=dataclasses.replace(model.config, steps=1))
+        expected = _estimate(once, cloud, cloud).transform
+        assert len(proposed.rotation) == 1
+    assert model.config.decoder == "pose" or len(proposed.rotation) >= 8
+    _close(proposed, jax.vmap(lambda _: expected)(proposed.translation), atol=1e-4)
 
 
 def test_random_model_does_not_answer_the_identity(model, pair):

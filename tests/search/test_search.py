@@ -3,6 +3,7 @@
 Most tests share one compiled program: clouds are padded to one size.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -11,12 +12,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from urrt_jax import register
+from urrt_jax import load_model, register
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import make_cloud, normalize_pair
+from urrt_jax.model.network import estimate, propose
 from urrt_jax.search import Found, Search, search
 
-_SMALL = Search(points=128, rotations=0, matches=16, kept=4)
+_SMALL = Search(points=128, matches=16, landmarks=0, tried=16)
 _SIZE = 220
 _AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
 _SHIFT = np.array([0.4, -0.2, 0.7])
@@ -39,9 +41,9 @@ def _pad(points: np.ndarray, rows: np.ndarray | None = None):
     return padded, mask
 
 
-def _search(model, config, source, target) -> Found:
+def _search(model, config, source, target, plain=None) -> Found:
     pair = normalize_pair(make_cloud(*source), make_cloud(*target))
-    return search(model, pair[0], pair[1], config, rigid.identity())
+    return search(model, pair[0], pair[1], config, rigid.identity() if plain is None else plain)
 
 
 _jitted = jax.jit(_search, static_argnums=1)
@@ -167,13 +169,39 @@ def test_vmap_agrees_with_a_loop(small_model, find, partial):
 
 def test_max_angle_excludes_a_half_turn(find, cloud):
     target = (cloud @ _turn(180).T).astype(np.float32)
-    bound = Search(points=128, rotations=0, matches=16, kept=4, max_angle=90)
+    bound = dataclasses.replace(_SMALL, max_angle=90)
     assert _degrees(find(cloud, target, bound).transform.rotation, np.eye(3)) <= 90.01
 
 
-def test_without_matches_the_network_alone_gives_a_rigid_answer(find, partial):
-    answer = find(*partial(60), Search(points=64, rotations=24, matches=0, kept=4))
+def test_the_given_estimate_is_kept_where_every_hypothesis_turns_too_far(small_model, cloud):
+    """With a score of 0: it was not found, but was there."""
+    plain = rigid.Rigid(jnp.asarray(_turn(120), jnp.float32), jnp.array([0.1, 0.2, 0.3]))
+    bound = dataclasses.replace(_SMALL, matches=8, tried=8, max_angle=1e-3)
+    found = _jitted(small_model, bound, _pad(cloud), _pad((cloud @ _turn(150).T).astype(np.float32)), plain)
+    assert float(found.score) == 0
+    jax.tree.map(lambda leaf, other: np.testing.assert_allclose(leaf, other, atol=1e-6), found.transform, plain)
+
+
+@pytest.mark.parametrize("source", [{"rotations": 24}, {"landmarks": 32}], ids=lambda source: next(iter(source)))
+def test_without_matches_the_network_alone_gives_a_rigid_answer(find, partial, source):
+    answer = find(*partial(60), dataclasses.replace(_SMALL, points=64, matches=0, **source))
     _assert_rigid(answer)
+
+
+def test_landmarks_speak_for_a_pose_that_the_estimate_misses(make_cloud_points):
+    """Another sample on either side, a third of both missing elsewhere, a turn far beyond the training's."""
+
+    @jax.jit
+    def both(source, target):
+        source, target, _ = normalize_pair(make_cloud(source), make_cloud(target))
+        model = load_model()
+        return estimate(model, source, target).transform.rotation, propose(model, source, target, 256).rotation
+
+    samples = make_cloud_points(1, 2), make_cloud_points(2, 2)
+    crops = [sample[np.argsort(sample[:, axis])[len(sample) // 3 :]] for axis, sample in enumerate(samples)]
+    estimated, proposed = both(crops[0], (crops[1] @ _turn(120).T).astype(np.float32))
+    assert _degrees(estimated, _turn(120)) > 15
+    assert min(_degrees(rotation, _turn(120)) for rotation in proposed) < 10
 
 
 def _assert_rigid(answer: Found) -> None:
@@ -208,15 +236,16 @@ def test_a_stray_point_does_not_matter(find, partial):
     assert _degrees(find(source, target).transform.rotation, _turn(120)) < 3
 
 
-@pytest.mark.parametrize("name", ["points", "support", "kept"])
+@pytest.mark.parametrize("name", ["points", "support", "tried", "kept"])
 def test_too_few_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"^{name}: expected at least .*, got 0$"):
         Search(**{name: 0})
 
 
-def test_negative_matches_are_refused():
-    with pytest.raises(ValueError, match=r"^matches: expected at least 0, got -1"):
-        Search(matches=-1)
+@pytest.mark.parametrize("name", ["matches", "landmarks"])
+def test_negative_numbers_are_refused_by_name(name):
+    with pytest.raises(ValueError, match=f"^{name}: expected at least 0, got -1"):
+        Search(**{name: -1})
 
 
 @pytest.mark.parametrize("rotations", [-1, 2, 23, 48])
@@ -226,8 +255,8 @@ def test_rotations_without_a_cover_are_refused(rotations):
 
 
 def test_a_search_without_hypotheses_is_refused():
-    with pytest.raises(ValueError, match=r"^matches and rotations: "):
-        Search(matches=0, rotations=0)
+    with pytest.raises(ValueError, match=r"^matches, landmarks and rotations: "):
+        Search(matches=0, landmarks=0)
 
 
 @pytest.mark.parametrize("name", ["normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance"])

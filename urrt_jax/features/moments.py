@@ -50,8 +50,13 @@ def moment_invariants(cloud: Cloud, octaves: int) -> Array:
         away = squares + jnp.sum(block**2, axis=1, keepdims=True) - 2 * jnp.matmul(block, points.T, precision=_HIGHEST)
         # Of points far out rounding is left, but no distance is negative.
         away = jnp.maximum(away, 0.0) / 2
-        # A product for every width: stacked first, the weights would take longer than their exponentials.
-        return jnp.stack([jnp.matmul(jnp.exp(-away / w**2), moments, precision=_HIGHEST) for w in widths])
+        # Half the width is the fourth power: one exponential for all. The barrier keeps XLA from undoing that.
+        weights, totals = jax.lax.optimization_barrier(jnp.exp(-away / widths[-1] ** 2)), []
+        for _ in widths:
+            # A product for every width: stacked first, the weights would take longer than their exponentials.
+            totals.append(jnp.matmul(weights, moments, precision=_HIGHEST))
+            weights = (weights * weights) * (weights * weights)
+        return jnp.stack(totals[::-1])
 
     # In blocks that stay in the cache; all N² weights at once take twice the time.
     count = points.shape[0]

@@ -23,6 +23,7 @@ _TOLERANCE = 0.01  # landmarks this near to each other agree
 _MISFIT = 0.05  # of distances between landmarks: a quarter as compatible as without
 _BASELINE = 0.3  # landmarks this near to each other, and their misfits, tell half as much as distant ones
 _NOTHING = 1e-18  # the squares of smaller numbers are lost
+_BRIEF = 2  # rounds, of every hypothesis that is only one among many
 _NEAR = 0.05  # a hypothesis gains half of a landmark's weight where it misses it by this
 
 
@@ -69,13 +70,30 @@ def align_landmarks(
     landmarks = _landmarks(source, target)
     start = given
     if rounds and seeds is not None and len(seeds):
-        start = _best_hypothesis(source, target, landmarks, given, seeds)
+        start = _best_start(landmarks, given, _hypothetical_weights(source, target, given, seeds))
 
     def agreeing(weights: Array, _: None) -> tuple[Array, None]:
         return _weigh(landmarks, given, weights, nearest_rotation), None
 
     weights, _ = jax.lax.scan(agreeing, start, None, length=rounds)
     return procrustes(source, target, weights, stiffness=_STIFFNESS)
+
+
+def hypotheses(source: Array, target: Array, weights: Array, seeds: np.ndarray) -> Rigid:
+    """What each of S seeds would say, rotation (S, 3, 3) and translation (S, 3), after a brief consensus of its own.
+
+    Few of them may be right where the clouds look alike in several poses, or share little: who can tell poses apart by
+    the clouds themselves (``urrt_jax.search``) will find it among them. Arguments as for ``align_landmarks``.
+    """
+    given = weights / jnp.where(jnp.max(weights) > 0, jnp.max(weights), 1.0)
+    landmarks = _landmarks(source, target)
+
+    def said(weights: Array) -> Rigid:
+        for _ in range(_BRIEF):
+            weights = _weigh(landmarks, given, weights, quick_rotation)
+        return procrustes(source, target, weights, stiffness=_STIFFNESS)
+
+    return jax.vmap(said)(_hypothetical_weights(source, target, given, seeds))
 
 
 def _weigh(landmarks: _Landmarks, given: Array, weights: Array, turn: Callable[[Array], Array]) -> Array:
@@ -119,14 +137,18 @@ def even_seeds(groups: Sequence[int], count: int) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _best_hypothesis(source: Array, target: Array, landmarks: _Landmarks, given: Array, seeds: np.ndarray) -> Array:
-    """The weights (M,) of the hypothesis that misses the fewest landmarks by the least; the given ones are one."""
+def _hypothetical_weights(source: Array, target: Array, given: Array, seeds: np.ndarray) -> Array:
+    """Weights (S, M) of S hypotheses: a landmark counts as much as it and others back the seed."""
     fits = _compatibility(source, target, seeds)
     backed = fits * jnp.matmul(fits[:, seeds] * given[seeds], fits)
     # Against their own mean, however little speaks for a hypothesis; what is as good as nothing stays nothing.
     mean = jax.lax.stop_gradient(jnp.matmul(backed, given / jnp.maximum(jnp.sum(given), 1.0)))
-    start = given * (backed / jnp.maximum(mean, _NOTHING)[:, None]) ** 2
-    start = jnp.concatenate([given[None], start])
+    return given * (backed / jnp.maximum(mean, _NOTHING)[:, None]) ** 2
+
+
+def _best_start(landmarks: _Landmarks, given: Array, hypothetical: Array) -> Array:
+    """The weights (M,) that say most: those of one of the hypotheses (S, M), or the given ones."""
+    start = jnp.concatenate([given[None], hypothetical])
     # Which one is best is a choice, and has no derivative; what the best one says has.
     fixed, trusted, tried = jax.lax.stop_gradient((landmarks, given, start))
     gains = jax.vmap(lambda weights: _gain(fixed, trusted, weights))(tried)

@@ -12,7 +12,7 @@ from jax import Array
 from urrt_jax.features.moments import invariant_count
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.config import ModelConfig
-from urrt_jax.model.consensus import align_landmarks, even_seeds
+from urrt_jax.model.consensus import align_landmarks, even_seeds, hypotheses
 from urrt_jax.model.encoding import Encoding
 from urrt_jax.model.landmarks import (
     key_size,
@@ -47,24 +47,41 @@ def init_decoder(config: ModelConfig, key: Array) -> dict:
 
 def decode(config: ModelConfig, params: dict, source: Encoding, target: Encoding) -> Rigid:
     """φ of eq. (3): the transform from source to target that the decoders see."""
-    weights = fusion_weights(source.regions.counts, target.regions.counts)
-    features = source.regions.features, target.regions.features
     if config.decoder == "pose":
-        return fuse_poses(decode_poses(config, params, *features), weights)
-    queries = region_queries(config, params["landmarks"], *features, weights)
+        poses = decode_poses(config, params, source.regions.features, target.regions.features)
+        return fuse_poses(poses, fusion_weights(source.regions.counts, target.regions.counts))
+    places, others, trust, groups = _match_landmarks(config, params, source, target)
+    seeds = even_seeds(groups, config.hypotheses)
+    return align_landmarks(places, others, trust, rounds=config.consensus, seeds=seeds)
+
+
+def decode_hypotheses(config: ModelConfig, params: dict, source: Encoding, target: Encoding, count: int) -> Rigid:
+    """About ``count`` transforms, stacked, that landmarks speak for; of decoders that regress the pose, their one."""
+    if config.decoder == "pose":
+        return jax.tree.map(lambda leaf: leaf[None], decode(config, params, source, target))
+    places, others, trust, groups = _match_landmarks(config, params, source, target)
+    return hypotheses(places, others, trust, even_seeds(groups, count))
+
+
+def _match_landmarks(
+    config: ModelConfig, params: dict, source: Encoding, target: Encoding
+) -> tuple[Array, Array, Array, list[int]]:
+    """Places (M, 3) of landmarks in both clouds, how much each counts (M,), and the sizes of the groups they are in.
+
+    Those of the decoders come first, then those of the source's points and of the target's.
+    """
+    weights = fusion_weights(source.regions.counts, target.regions.counts)
+    queries = region_queries(config, params["landmarks"], source.regions.features, target.regions.features, weights)
     asked, groups, trust = len(queries.weights), [len(queries.weights)], [queries.weights]
     if config.lookups:
         keys, real, _ = map(jnp.concatenate, zip(source.lookups, target.lookups, strict=True))
+        # As many of either cloud's points, so that swapped clouds have the same ones.
         groups += [len(source.lookups.real), len(target.lookups.real)]
         trust.append(lookup_weights(config, params["trust"], keys, real))
     here = _find(config, queries.source, target.lookups.keys, source)
     there = _find(config, queries.target, source.lookups.keys, target)
-    # Landmarks of the decoders, then of the source's points, then of the target's, each in both clouds.
     places = jnp.concatenate([here[:asked], source.lookups.places, here[asked:]])
-    others = jnp.concatenate([there, target.lookups.places])
-    # As many of either cloud's points, so that swapped clouds have the same ones.
-    seeds = even_seeds(groups, config.hypotheses)
-    return align_landmarks(places, others, jnp.concatenate(trust), rounds=config.consensus, seeds=seeds)
+    return places, jnp.concatenate([there, target.lookups.places]), jnp.concatenate(trust), groups
 
 
 def _find(config: ModelConfig, queries: Array, others: Array, cloud: Encoding) -> Array:

@@ -17,7 +17,7 @@ from urrt_jax.geometry.clouds import Cloud, denormalize_translation, normalize_p
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.attention import RegionTransformer
 from urrt_jax.model.config import ModelConfig
-from urrt_jax.model.decoder import decode, init_decoder
+from urrt_jax.model.decoder import decode, decode_hypotheses, init_decoder
 from urrt_jax.model.encoder import PointEncoder
 from urrt_jax.model.encoding import Encoding, encode_cloud
 from urrt_jax.model.partition import RegionBranches, branch_logits, region_labels
@@ -97,6 +97,15 @@ def estimate(model: Model, source: Cloud, target: Cloud, start: Rigid | None = N
     last, (steps, seen, encodings) = jax.lax.scan(step, begin, None, length=config.steps)
     final_seen, final_encoding = jax.tree.map(lambda values: values[-1], (seen, encodings))
     return Estimate(last, steps, final_seen, final_encoding, target_encoding)
+
+
+def propose(model: Model, source: Cloud, target: Cloud, count: int) -> Rigid:
+    """About ``count`` transforms that landmarks speak for, stacked, in one step from where the clouds are.
+
+    Where ``estimate`` gives the one on which most landmarks agree, these are what single ones and those compatible with
+    them would say. Clouds as for ``estimate``.
+    """
+    return decode_hypotheses(model.config, model.params["decoder"], encode(model, source), encode(model, target), count)
 
 
 def estimate_subsampled(model: Model, source: Cloud, target: Cloud) -> Estimate:

@@ -1,4 +1,4 @@
-"""Global search: hypotheses from matched features and from the network at a cover of all rotations, then the best."""
+"""Global search: hypotheses from matched features and from the network's landmarks, the best of which are refined."""
 
 from urrt_jax.search.config import Search
 from urrt_jax.search.cover import rotation_cover

@@ -17,11 +17,13 @@ class Search:
         agrees with a pose that brings its ends closer than this.
       matches: hypotheses from matched features, at most; 0 for none.
       support: matches that a hypothesis is made of, besides its first.
+      landmarks: hypotheses from the network's landmarks, about; 0 for none.
       rotations: members of the cover of SO(3) at which the network makes a step: 0, 1 (the clouds as they are), 24 or
         60.
       max_angle: hypotheses that turn by more, in degrees, are not considered: shapes that are nearly symmetric often
         fit as well when turned around, and who knows better should say so.
-      kept: hypotheses that are refined on the subsample.
+      tried: hypotheses that are briefly refined.
+      kept: those of them that are refined on the whole subsample.
       inlier_distance: beyond it a point counts as unmatched when poses are compared.
     """
 
@@ -31,15 +33,17 @@ class Search:
     match_distance: float = 1.5
     matches: int = 64
     support: int = 16
-    rotations: int = 24
+    landmarks: int = 256
+    rotations: int = 0
     max_angle: float = 180.0
-    kept: int = 16
+    tried: int = 64
+    kept: int = 4
     inlier_distance: float = 1.5
 
     def __post_init__(self) -> None:
-        check_whole(self, points=16, matches=0, support=3, kept=1)
+        check_whole(self, points=16, matches=0, support=3, landmarks=0, tried=1, kept=1)
         if type(self.rotations) is not int or self.rotations not in (0, 1, 24, 60):
             raise ValueError(f"rotations: expected 0, 1, 24 or 60, got {self.rotations!r}")
-        if not self.matches + self.rotations:
-            raise ValueError("matches and rotations: both are 0, which leaves no hypothesis")
+        if not self.matches + self.landmarks + self.rotations:
+            raise ValueError("matches, landmarks and rotations: all are 0, which leaves no hypothesis")
         check_positive(self, "normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance")

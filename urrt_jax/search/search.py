@@ -1,7 +1,8 @@
 """The search itself: hypotheses, their scores, the best few refined, the best of those."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +16,17 @@ from urrt_jax.geometry.neighbors import spacing
 from urrt_jax.geometry.normals import normals
 from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
-from urrt_jax.model.network import Model, estimate
+from urrt_jax.model.network import Model, estimate, propose
 from urrt_jax.refine.icp import anneal
 from urrt_jax.search.config import Search
 from urrt_jax.search.cover import rotation_cover
 from urrt_jax.search.matches import match_features, poses_from_matches
 
 _NORMAL_POINTS = 4096  # of a large cloud, for the normals at its subsample
-_SCORED_POINTS = 256  # the first of a farthest-point sample are a coarser one
-_STEPS = 30
+_COARSE_POINTS = 256  # the first of a farthest-point sample are a coarser one
+_BRIEF_STEPS, _STEPS = 8, 30
+_NEARLY = 1.5  # inlier distances that a pose may be off before it is refined in full
+_AT_ONCE = 16  # poses
 
 
 class Found(NamedTuple):
@@ -44,10 +47,11 @@ def search(model: Model, source: Cloud | Prepared, target: Cloud | Prepared, con
     """The best pose among all hypotheses, of two clouds normalised together (``normalize_pair``).
 
     Hypotheses come from matched features (``poses_from_matches``), which partial overlap and any rotation leave alone,
-    and from a step of the network at every member of a cover of SO(3), which sparse and noisy clouds leave alone;
-    ``plain``, the estimate at hand, is one more. All are scored by how well the subsamples lie on each other in both
-    directions, the best ``config.kept`` refined, and the best of those returned; ``plain``, with a score of 0, where
-    none turns by less than the largest angle. A pure function: nothing is drawn.
+    and from the network's landmarks (``propose``), which sparse and noisy clouds leave alone; where asked for, also
+    from a step of the network at every member of a cover of SO(3). ``plain``, the estimate at hand, is one more. They
+    are told apart by how well the subsamples lie on each other in both directions: the best ``config.tried`` as they
+    are, the best ``config.kept`` of these after a brief refinement on few points, the best one after a full one. Where
+    none turns by less than the largest angle, it is ``plain``, with a score of 0. A pure function: nothing is drawn.
     """
     # It is a choice: derivatives pass through what follows it.
     model, plain = jax.tree.map(jax.lax.stop_gradient, (model, plain))
@@ -57,40 +61,45 @@ def search(model: Model, source: Cloud | Prepared, target: Cloud | Prepared, con
     guesses = [jax.tree.map(lambda leaf: leaf[None], plain)]
     if config.matches:
         guesses.append(_from_features(clouds, small, width, config))
+    seen = _first(small[0], model.config.points), _first(small[1], model.config.points)
+    if config.landmarks:
+        guesses.append(propose(model, *seen, config.landmarks))
     if config.rotations:
-        guesses.append(_from_network(model, *small, config.rotations))
+        guesses.append(_from_network(model, *seen, config.rotations))
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *guesses)
 
     reach = config.inlier_distance * width
-    some = _first(small[0]), _first(small[1])
-    # Before refinement a hypothesis may be a few spacings off.
-    first = jax.lax.map(lambda pose: agreement(pose, small, some, 3 * reach), every, batch_size=16)
-    first = jnp.where(_allowed(every, config), first, -1.0)
-    _, best = jax.lax.top_k(first, min(config.kept, len(first)))
+    some = _first(small[0], _COARSE_POINTS), _first(small[1], _COARSE_POINTS)
+    tried, _ = _best(every, lambda pose: agreement(pose, small, some, _NEARLY * reach), config.tried, config)
 
-    def refined(pose: Rigid) -> tuple[Rigid, Array]:
-        better = anneal(*small, pose, 3 * reach, reach, iterations=_STEPS)
-        return better, agreement(better, small, small, reach)
+    coarse = config.inlier_distance * jnp.maximum(jnp.maximum(*map(spacing, some)), 1e-6)
+    denser = _first(small[1], 2 * _COARSE_POINTS)
+    brief = _each(lambda pose: anneal(some[0], denser, pose, 3 * coarse, coarse, iterations=_BRIEF_STEPS), tried)
+    kept, _ = _best(brief, lambda pose: agreement(pose, small, some, _NEARLY * reach), config.kept, config)
 
-    poses, scores = jax.vmap(refined)(jax.tree.map(lambda leaf: leaf[best], every))
-    scores = jnp.where(_allowed(poses, config), scores, -1.0)
-    winner = jnp.argmax(scores)
-    found = jax.tree.map(lambda leaf, given: jnp.where(scores[winner] >= 0, leaf[winner], given), poses, plain)
-    return Found(found, jnp.maximum(scores[winner], 0.0), width)
+    full = _each(lambda pose: anneal(*small, pose, 3 * reach, reach, iterations=_STEPS), kept)
+    poses, scores = _best(full, lambda pose: agreement(pose, small, small, reach), 1, config)
+    found = jax.tree.map(lambda leaf, given: jnp.where(scores[0] >= 0, leaf[0], given), poses, plain)
+    return Found(found, jnp.maximum(scores[0], 0.0), width)
+
+
+def _each(function: Callable[[Rigid], Any], poses: Rigid) -> Any:
+    return jax.lax.map(function, poses, batch_size=_AT_ONCE)
+
+
+def _best(poses: Rigid, score: Callable[[Rigid], Array], count: int, config: Search) -> tuple[Rigid, Array]:
+    """The ``count`` best of H poses and their scores, best first; -1 for those that turn too far."""
+    allowed = rigid.rotation_angle(poses.rotation, jnp.eye(3)) <= jnp.deg2rad(config.max_angle) + 1e-4
+    scores, rows = jax.lax.top_k(jnp.where(allowed, _each(score, poses), -1.0), min(count, len(allowed)))
+    return jax.tree.map(lambda leaf: leaf[rows], poses), scores
 
 
 def _subsample(cloud: Prepared, count: int) -> Cloud:
     return subsample(cloud.cloud, count, order=cloud.order)
 
 
-def _first(cloud: Cloud) -> Cloud:
-    return jax.tree.map(lambda leaf: leaf[:_SCORED_POINTS], cloud)
-
-
-def _allowed(poses: Rigid, config: Search) -> Array:
-    """Which of H poses turn by no more than the largest angle, (H,)."""
-    angles = rigid.rotation_angle(poses.rotation, jnp.eye(3))
-    return angles <= jnp.deg2rad(config.max_angle) + 1e-4
+def _first(cloud: Cloud, count: int) -> Cloud:
+    return jax.tree.map(lambda leaf: leaf[:count], cloud)
 
 
 def _from_features(
@@ -110,8 +119,6 @@ def _from_features(
 def _from_network(model: Model, source: Cloud, target: Cloud, rotations: int) -> Rigid:
     """The network's estimates after one step, with the source turned by every member of the cover."""
     once = dataclasses.replace(model, config=dataclasses.replace(model.config, steps=1))
-    # Farthest-point samples: their first points are a coarser one.
-    source, target = (jax.tree.map(lambda leaf: leaf[: model.config.points], cloud) for cloud in (source, target))
 
     def at(rotation: Array) -> Rigid:
         return estimate(once, source, target, Rigid(rotation, jnp.zeros(3))).transform
