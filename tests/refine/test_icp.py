@@ -71,6 +71,32 @@ def test_planes_align_independent_samples_better_than_points_do():
     assert planes < 0.5 * points
 
 
+def test_sparse_noisy_samples_end_softly():
+    """The nearest point is a poor counterpart; all points together know better."""
+    random = np.random.default_rng(0)
+    samples = [
+        [_surface(400, 2 * k + side) + random.normal(scale=0.01, size=(400, 3)) for side in (0, 1)] for k in range(6)
+    ]
+    soft, hard = (
+        [refine(source, target @ TURN.T, config, rows=400) for source, target in samples]
+        for config in (ICP(), ICP(soft_points=0))
+    )
+    assert all(converged for _, converged in soft)
+    assert np.mean([error for error, _ in soft]) < 0.8 * np.mean([error for error, _ in hard])
+
+
+@pytest.mark.parametrize("kind", ["the same points", "a crop", "outliers"])
+def test_only_whole_clouds_without_counterparts_end_softly(kind):
+    points, other, random = _surface(400), _surface(400, 1), np.random.default_rng(1)
+    source = {
+        "the same points": points,
+        "a crop": other[np.argsort(other[:, 0])[:200]],
+        "outliers": np.concatenate([points[:300], random.uniform(-1, 1, size=(100, 3))]),
+    }[kind]
+    soft, hard = (refine(source, points @ TURN.T, config, rows=400) for config in (ICP(), ICP(soft_points=0)))
+    assert soft == hard
+
+
 def test_gross_outliers_do_not_pull(surface):
     stray = np.random.default_rng(1).uniform(-1.5, 1.5, size=(120, 3))
     error, converged = refine(np.concatenate([surface, stray]), surface @ TURN.T)
@@ -157,7 +183,8 @@ def test_the_transform_of_a_degenerate_cloud_is_rigid(shape, angle):
 
 
 _EXACTLY = {"tolerance": 1e-9, "iterations": 400, "coarse_points": 64}
-_FROM_HERE = _EXACTLY | {"coarse_points": 0, "plane": 0.0}
+_HARD = _EXACTLY | {"soft_points": 0}
+_FROM_HERE = _HARD | {"coarse_points": 0, "plane": 0.0}
 
 
 def _slope(source: Cloud, target: Cloud, config: ICP):
@@ -190,8 +217,8 @@ def _even_surface(seed: int) -> np.ndarray:
 @pytest.mark.parametrize(
     "config",
     [
-        pytest.param(ICP(**_EXACTLY), id="planes"),
-        pytest.param(ICP(**_EXACTLY, plane=0.0), id="points"),
+        pytest.param(ICP(**_HARD), id="planes"),
+        pytest.param(ICP(**_HARD, plane=0.0), id="points"),
         pytest.param(ICP(**_FROM_HERE, mutual=True), id="mutual"),
         pytest.param(ICP(**_FROM_HERE, trim=True), id="trim"),
     ],
@@ -240,7 +267,7 @@ def test_single_precision_stays_so_where_double_precision_is_on(plane, x64):
 def test_vmap_agrees_with_a_loop(x64):
     pairs = [(_surface(200, seed), _surface(200 - 40 * seed, seed) @ TURN.T) for seed in range(3)]
     pairs = [tuple(_padded(each, 200) for each in pair) for pair in pairs]
-    config = ICP(**_EXACTLY, plane=0.0)
+    config = ICP(**_HARD, plane=0.0)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
     together = jax.jit(jax.vmap(lambda *pair: _slope(*pair, config)), compiler_options=_HASTY)(*stacked)
     alone = jax.tree.map(lambda *leaves: np.stack(leaves), *(_jitted_slope(*pair, config) for pair in pairs))
@@ -262,6 +289,8 @@ def test_vmap_agrees_with_a_loop(x64):
         {"plane": float("nan")},
         {"normal_radius": 0.0},
         {"normal_radius": -3.0},
+        {"soft_points": -1},
+        {"soft_points": 640.5},
     ],
 )
 def test_unusable_options_are_named(options):

@@ -65,9 +65,7 @@ def align_landmarks(
       seeds: (S,), rows of landmarks: the first round starts from the best of their hypotheses, or from the given
         weights where these are better.
     """
-    largest = jax.lax.stop_gradient(jnp.max(weights))
-    given = weights / jnp.where(largest > 0, largest, 1.0)
-    landmarks = _landmarks(source, target)
+    given, landmarks = _relative(weights), _landmarks(source, target)
     start = given
     if rounds and seeds is not None and len(seeds):
         start = _best_start(landmarks, given, _hypothetical_weights(source, target, given, seeds))
@@ -85,8 +83,7 @@ def hypotheses(source: Array, target: Array, weights: Array, seeds: np.ndarray) 
     Few of them may be right where the clouds look alike in several poses, or share little: who can tell poses apart by
     the clouds themselves (``urrt_jax.search``) will find it among them. Arguments as for ``align_landmarks``.
     """
-    given = weights / jnp.where(jnp.max(weights) > 0, jnp.max(weights), 1.0)
-    landmarks = _landmarks(source, target)
+    given, landmarks = _relative(weights), _landmarks(source, target)
 
     def said(weights: Array) -> Rigid:
         for _ in range(_BRIEF):
@@ -94,6 +91,12 @@ def hypotheses(source: Array, target: Array, weights: Array, seeds: np.ndarray) 
         return procrustes(source, target, weights, stiffness=_STIFFNESS)
 
     return jax.vmap(said)(_hypothetical_weights(source, target, given, seeds))
+
+
+def _relative(weights: Array) -> Array:
+    """The weights (M,), the largest of which is 1; their common factor has no derivative."""
+    largest = jax.lax.stop_gradient(jnp.max(weights))
+    return weights / jnp.where(largest > 0, largest, 1.0)
 
 
 def _weigh(landmarks: _Landmarks, given: Array, weights: Array, turn: Callable[[Array], Array]) -> Array:

@@ -23,6 +23,9 @@ class ICP:
       plane: 1 measures distances to the neighbour's tangent plane, 0 to the neighbour; between them both count. Planes
         let samples of one surface slide on each other; points hold where planes don't.
       normal_radius: of the neighbourhood of a normal, in spacings.
+      soft_points: clouds of at most so many points each end softly: every point pairs with every other, by how likely,
+        in a third stage of as many iterations at most, where the second one found that points have no counterparts
+        and that the clouds overlap whole. Time and memory grow with the square; 0 leaves it out.
       mutual: only pairs count that are each other's nearest, as far as the chosen points go.
       trim: only the nearest pairs count, as many as the overlap is estimated to hold.
       tolerance: a stage has converged when a step turns by less than this (radians) and moves by less than this share
@@ -37,12 +40,13 @@ class ICP:
     inlier_distance: float = 1.0
     plane: float = 0.9
     normal_radius: float = 3.0
+    soft_points: int = 640
     mutual: bool = False
     trim: bool = False
     tolerance: float = 5e-5
 
     def __post_init__(self) -> None:
-        check_whole(self, coarse_points=0, coarse_iterations=1, points=3, iterations=1)
+        check_whole(self, coarse_points=0, coarse_iterations=1, points=3, iterations=1, soft_points=0)
         check_positive(self, "reach", "inlier_distance", "normal_radius", "tolerance")
         if not (isinstance(self.plane, int | float) and 0 <= self.plane <= 1):
             raise ValueError(f"plane: expected a share from 0 to 1, got {self.plane!r}")

@@ -4,7 +4,7 @@ Stage one looks for the basin on small even subsamples, point to point (Besl and
 pairs from both directions, distances along normals as well as between points. Both weigh pairs by Geman and McClure's
 function, whose width shrinks step by step (as in Zhou et al. 2016): in stage two to the spacing, and from there to what
 the pairs that count say of their own distances. Where points have their counterparts, that is next to nothing, and
-those without do not pull.
+those without do not pull. Where sparse clouds have none, a third stage pairs all points (``soft.py``).
 """
 
 import math
@@ -22,7 +22,8 @@ from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid, procrustes
 from urrt_jax.refine.config import ICP
 from urrt_jax.refine.lanes import while_each
-from urrt_jax.refine.pairs import Surface, find_pairs, pair_up, robust_weights, trimmed
+from urrt_jax.refine.pairs import Pairs, Surface, find_pairs, pair_up, robust_weights, trimmed
+from urrt_jax.refine.soft import soften
 from urrt_jax.refine.step import bounded_step, damped_solve, move, normal_equations
 
 _SHRINK, _SHRINK_FINE = 0.8, 0.7
@@ -30,6 +31,11 @@ _SPREADS = 2.0  # the last reach, in root mean square distances of the pairs tha
 _NARROWEST = 0.05  # the last reach at least, in inlier distances
 _STEADY, _STEADY_SHARE = 20.0, 1000.0  # by how much it may still change: tolerances, and as many inlier distances each
 _NORMAL_POINTS = 4096  # of a large cloud, that normals are made from
+_APART = 0.3  # the last reach, in inlier distances, above which points have no counterparts
+_WHOLE, _TOUCHING = (
+    0.8,
+    1.5,
+)  # the share of points with a neighbour this near, in spacings, of clouds that overlap whole
 _SEEN = 5.0  # pairs farther apart than this many reaches weigh less than 0.0015 and are not looked for
 
 
@@ -81,7 +87,14 @@ def icp(
         transform, reach = _find_basin(*small, transform, config)
     elif reach is None:
         reach = jnp.array(config.reach, precision)
-    return _settle(source, target, transform, reach, config)
+    settled, sparse = _settle(source, target, transform, reach, config)
+    if max(source.cloud.points.shape[0], target.cloud.points.shape[0]) > config.soft_points:
+        return settled
+
+    unit = jnp.maximum(source.spacing, target.spacing)
+    limits = {"iterations": config.iterations, "tolerance": config.tolerance}
+    softly = Refinement(*soften(source.cloud, target.cloud, settled.transform, unit, needed=sparse, **limits))
+    return jax.tree.map(lambda soft, hard: jnp.where(sparse, soft, hard), softly, settled)
 
 
 def anneal(
@@ -122,8 +135,8 @@ def _first(cloud: Cloud, count: int) -> Cloud:
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[:count]), cloud)
 
 
-def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, config: ICP) -> Refinement:
-    """The second stage, and the derivatives of its end."""
+def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, config: ICP) -> tuple[Refinement, Array]:
+    """The second stage, the derivatives of its end, and whether it leaves whole clouds without counterparts, ()."""
     surfaces = _surface(source, config), _surface(target, config)
     loose: tuple[Surface, Surface] = jax.tree.map(jax.lax.stop_gradient, surfaces)
     floor = config.inlier_distance * jnp.maximum(source.spacing, target.spacing)
@@ -171,7 +184,19 @@ def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, co
         solve=lambda _, rest: rest,
         tangent_solve=lambda linear, value: damped_solve(jax.jacobian(linear)(value), value),
     )
-    return Refinement(move(rest[:6], end.transform), end.settled, end.iteration)
+    sparse = end.settled & (end.reach > _APART * floor) & _overlap_whole(pairs, *loose, floor / config.inlier_distance)
+    return Refinement(move(rest[:6], end.transform), end.settled, end.iteration), sparse
+
+
+def _overlap_whole(pairs: Pairs, source: Surface, target: Surface, spacing: Array) -> Array:
+    """Whether nearly all points that ask, of either cloud, found a neighbour, ()."""
+    near = pairs.squared <= (_TOUCHING * spacing) ** 2
+    count = source.asking.points.shape[0]
+    shares = [
+        jnp.sum(found) / jnp.maximum(jnp.sum(asking.mask), 1)
+        for found, asking in ((near[:count], source.asking), (near[count:], target.asking))
+    ]
+    return jnp.minimum(*shares) >= _WHOLE
 
 
 def _squared_reach(squared: Array, weights: Array, widest: Array) -> Array:

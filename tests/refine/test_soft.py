@@ -1,0 +1,184 @@
+"""The soft end of refinement: what it settles on, what it estimates, its derivatives, and clouds that say nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from urrt_jax.geometry import rigid
+from urrt_jax.geometry.clouds import Cloud, make_cloud
+from urrt_jax.geometry.neighbors import spacing
+from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.refine.soft import Match, Side, Softened, match, soften
+
+TURN = Rotation.from_euler("zyx", [2, -1, 1.5], degrees=True).as_matrix()
+SHIFT = np.array([0.02, -0.01, 0.015])
+_ROWS = 160
+_HASTY = {"xla_backend_optimization_level": 0}
+
+
+def _egg(count: int, seed: int, noise: float = 0.0) -> np.ndarray:
+    """A sample of a bent ellipsoid that no turn maps to itself, (count, 3), with noise."""
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(count, 3))
+    points *= np.array([1.0, 0.7, 0.45]) / np.linalg.norm(points, axis=1, keepdims=True)
+    points[:, 2] += 0.3 * points[:, 0] ** 2 + 0.2 * points[:, 0] * points[:, 1]
+    return points + noise * random.normal(size=points.shape)
+
+
+def _cloud(points: np.ndarray, rows: int = _ROWS) -> Cloud:
+    values = np.zeros((rows, 3))
+    values[: len(points)] = points
+    return make_cloud(jnp.asarray(values, jnp.result_type(float)), np.arange(rows) < len(points))
+
+
+def _softened(source: Cloud, target: Cloud, initial: Rigid, needed=True, tolerance=1e-5) -> Softened:
+    unit = jnp.maximum(spacing(source), spacing(target))
+    limits = {"iterations": 300, "tolerance": tolerance}
+    return soften(source, target, initial, unit, needed=jnp.asarray(needed), **limits)
+
+
+_soften = jax.jit(_softened, compiler_options=_HASTY)
+
+
+def _start(degrees: float = 1.0) -> Rigid:
+    off = Rotation.from_rotvec(np.deg2rad(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    dtype = jnp.result_type(float)
+    return Rigid(jnp.asarray(off @ TURN, dtype), jnp.asarray(SHIFT, dtype))
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[np.ndarray, np.ndarray]:
+    return _egg(150, 1, 0.01), _egg(160, 2, 0.01) @ TURN.T + SHIFT
+
+
+@pytest.fixture(scope="module")
+def found(pair) -> Softened:
+    return _soften(*map(_cloud, pair), _start())
+
+
+def _degrees(first, second) -> float:
+    turn = np.asarray(first, np.float64).T @ np.asarray(second, np.float64)
+    return float(np.rad2deg(Rotation.from_matrix(turn).magnitude()))
+
+
+def test_settles(found):
+    assert bool(found.converged)
+    assert 3 < int(found.iterations) < 200
+
+
+def test_comes_nearer_than_it_began():
+    errors = []
+    for seed in range(5):
+        target = _egg(150, 10 * seed + 1, 0.01) @ TURN.T + SHIFT
+        found = _soften(_cloud(_egg(150, 10 * seed, 0.01)), _cloud(target), _start(3.0))
+        errors.append(_degrees(found.transform.rotation, TURN))
+    assert np.mean(errors) < 1.5
+
+
+def test_does_not_depend_on_where_it_began(pair, found):
+    other = _soften(*map(_cloud, pair), _start(-1.0))
+    assert _degrees(other.transform.rotation, found.transform.rotation) < 0.1  # the surface itself is of the beginning
+
+
+def test_without_need_nothing_moves(pair):
+    found = _soften(*map(_cloud, pair), _start(), False)
+    assert int(found.iterations) == 0
+    for leaf, given in zip(found.transform, _start(), strict=True):
+        np.testing.assert_array_equal(leaf, given)
+
+
+def test_swapping_the_clouds_inverts_the_transform(pair, found):
+    back = _soften(*map(_cloud, reversed(pair)), rigid.inverse(_start()))
+    assert _degrees(rigid.inverse(back.transform).rotation, found.transform.rotation) < 1e-2
+
+
+def test_order_of_points_and_place_of_padding_do_not_matter(pair, found):
+    rows = np.random.default_rng(0).permutation(_ROWS)
+    clouds = (jax.tree.map(lambda leaf: leaf[rows], _cloud(points)) for points in pair)
+    for leaf, expected in zip(_soften(*clouds, _start()).transform, found.transform, strict=True):
+        np.testing.assert_allclose(leaf, expected, atol=1e-4)
+
+
+def test_turning_the_target_turns_the_answer(pair, found):
+    turn = Rotation.from_rotvec([1.0, 0.5, -2.0]).as_matrix()
+    start = rigid.compose(Rigid(jnp.asarray(turn, jnp.float32), jnp.zeros(3)), _start())
+    turned = _soften(_cloud(pair[0]), _cloud(pair[1] @ turn.T), start)
+    assert _degrees(turned.transform.rotation, turn @ np.asarray(found.transform.rotation, np.float64)) < 1e-2
+
+
+def _matched(points: np.ndarray, others: np.ndarray, normals: np.ndarray, widths) -> Match:
+    sides = [Side(_cloud(each), jnp.asarray(np.resize(normals, (_ROWS, 3)), jnp.float32)) for each in (points, others)]
+    return jax.jit(match, compiler_options=_HASTY)(*sides, rigid.identity(), jnp.asarray(widths, jnp.float32))
+
+
+def test_estimates_how_far_points_lie_along_and_across_the_surface():
+    """Points of a plane, each with one partner that is off by known amounts, far from all others."""
+    random = np.random.default_rng(0)
+    points = np.stack([*np.meshgrid(np.arange(12.0), np.arange(12.0)), np.zeros((12, 12))], -1).reshape(-1, 3)
+    off = random.normal(size=points.shape) * [0.05, 0.05, 0.02]
+    found = _matched(points, points + off, np.array([0.0, 0.0, 1.0]), (0.2, 0.1))
+    expected = [np.sqrt(np.mean(off[:, :2] ** 2)), np.sqrt(np.mean(off[:, 2] ** 2))]
+    np.testing.assert_allclose(found.widths, expected, rtol=0.05)
+    assert int(found.paired) == len(points)
+
+
+def test_points_without_partners_say_nothing():
+    points = _egg(100, 0)
+    found = _matched(points, points + np.array([0.0, 0.0, 50.0]), np.array([0.0, 0.0, 1.0]), (0.1, 0.05))
+    assert int(found.paired) == 0
+    np.testing.assert_array_equal(found.gradient, 0.0)
+    assert np.isfinite(found.widths).all()
+
+
+@pytest.mark.parametrize("argument", [0, 1], ids=["source", "target"])
+def test_derivative_agrees_with_finite_differences(argument, pair, x64):
+    """Of the place where everything settles, with the surface that both clouds make."""
+    weights = jnp.asarray(np.random.default_rng(5).normal(size=(3, 4)))
+    direction = np.random.default_rng(7).normal(size=pair[argument].shape)
+    whole = np.zeros((_ROWS, 3))
+    whole[: len(direction)] = direction
+
+    def total(step):
+        clouds = list(map(_cloud, pair))
+        clouds[argument] = clouds[argument]._replace(points=clouds[argument].points + step * whole)
+        found = _softened(*clouds, _start(), tolerance=1e-11).transform
+        return jnp.sum(weights * jnp.concatenate([found.rotation, found.translation[:, None]], axis=1))
+
+    both = jax.jit(jax.value_and_grad(total), compiler_options=_HASTY)
+    expected = float(both(1e-6)[0] - both(-1e-6)[0]) / 2e-6
+    assert float(both(0.0)[1]) == pytest.approx(expected, rel=2e-3)
+
+
+_POOR = {
+    "empty": np.zeros((0, 3)),
+    "one point": np.ones((1, 3)),
+    "coincident": np.ones((40, 3)),
+    "a line": np.outer(np.linspace(-1, 1, 40), [0.3, -0.5, 0.8]),
+    "far away": _egg(40, 0) + 100.0,
+}
+
+
+@pytest.mark.parametrize("kind", _POOR)
+def test_poor_clouds_give_finite_poses_and_derivatives(kind, pair):
+    def total(points):
+        cloud = _cloud(_POOR[kind])
+        found = _softened(cloud._replace(points=points), _cloud(pair[1]), _start())
+        return jnp.sum(found.transform.rotation) + jnp.sum(found.transform.translation), found.transform
+
+    points = _cloud(_POOR[kind]).points
+    gradient, transform = jax.jit(jax.grad(total, has_aux=True), compiler_options=_HASTY)(points)
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(transform.rotation @ transform.rotation.T, np.eye(3), atol=1e-4)
+    assert np.isfinite(transform.translation).all()
+
+
+def test_vmap_agrees_with_one_by_one(pair, found):
+    clouds = [jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), _cloud(points)) for points in pair]
+    starts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), _start())
+    together = jax.jit(jax.vmap(_softened), compiler_options=_HASTY)
+    many = together(*clouds, starts, jnp.array([True, False, True]))
+    np.testing.assert_array_equal(np.asarray(many.iterations) > 0, [True, False, True])
+    for row in (0, 2):
+        np.testing.assert_allclose(many.transform.rotation[row], found.transform.rotation, atol=1e-5)
