@@ -1,5 +1,8 @@
 """What several tests share: an asymmetric cloud, a pose, a small network that does not answer the identity."""
 
+import os
+import tempfile
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +19,20 @@ settings.load_profile("urrt")
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    _compile_in_less_time(config)
     config.addinivalue_line("markers", "slow: takes tens of seconds; leave out with -m 'not slow'")
+
+
+def _compile_in_less_time(config: pytest.Config) -> None:
+    """Tests compile for an hour and run for minutes: optimise less, and let the workers share what they compile."""
+    if hasattr(config, "workerinput"):
+        return  # inherits the environment
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1".strip()
+    shared = tempfile.TemporaryDirectory(prefix="urrt-tests-")
+    config.add_cleanup(shared.cleanup)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = shared.name
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "0"
 
 
 def _asymmetric_cloud(seed: int = 0, scale: int = 1) -> np.ndarray:

@@ -133,6 +133,22 @@ def test_lanes_do_not_wait_for_the_slowest():
     assert calls["step"] <= 6400 // 3
 
 
+@pytest.mark.parametrize("left", [0, 3])
+def test_problems_done_at_the_start_take_no_turn(left):
+    """Of 200 problems, a few of two steps are left: one lane after the other would ask for every one of them."""
+    calls: collections.Counter[str] = collections.Counter()
+
+    def step(_, state):
+        jax.debug.callback(lambda now: calls.update(["step"]), state)
+        return state - 1
+
+    numbers = jnp.zeros(200).at[jnp.array([5, 90, 199])[:left]].set(2)
+    end = jax.vmap(lambda number: while_each(lambda now: now > 0, step, number, ()))(numbers)
+    np.testing.assert_array_equal(end, jnp.zeros(200))
+    jax.effects_barrier()
+    assert calls["step"] <= 2 * 25 * (left > 0)  # two turns of all lanes
+
+
 def _scalar(start, weight):
     """A loop whose end depends on both floats."""
     return while_each(lambda now: now < 10, lambda by, now: now + by, start, weight)

@@ -47,32 +47,36 @@ def _queue(unfinished: Callable, step: Callable, start: Any, context: Any, batch
     size = jax.tree.leaves(start)[0].shape[0]
     lanes = min(size, max(_FEW, min(size // 8, _MANY)))
     axes = jax.tree.map(lambda has: 0 if has else None, batched)
+    # Problems that are done before they begin stand behind all others, where nobody asks for them.
+    begun = ~jax.vmap(unfinished)(start)
+    queue, waiting = jnp.argsort(begun), jnp.sum(~begun)
 
-    def take(tree: Any, problem: Array) -> Any:
-        return jax.tree.map(lambda leaf: leaf[problem], tree)
+    def ask(place: Array) -> Array:
+        return queue[jnp.minimum(place, size - 1)]
 
     def busy(now: tuple) -> Array:
-        problem, *_ = now
-        return jnp.any(problem < size)
+        place, *_ = now
+        return jnp.any(place < waiting)
 
     def advance(now: tuple) -> tuple:
-        problem, following, states, ends = now
-        mine = jax.tree.map(lambda leaf, has: leaf[jnp.minimum(problem, size - 1)] if has else leaf, context, batched)
+        place, following, states, ends = now
+        problem = ask(place)
+        mine = jax.tree.map(lambda leaf, has: leaf[problem] if has else leaf, context, batched)
         going = jax.vmap(unfinished)(states)
         after = jax.vmap(step, in_axes=(axes, 0))(mine, states)
         states = jax.tree.map(lambda new, old: jnp.where(_spread(going, new), new, old), after, states)
-        done = (problem < size) & ~jax.vmap(unfinished)(states)
+        done = (place < waiting) & ~jax.vmap(unfinished)(states)
         # A lane without a problem points beyond the last one, where nothing is written.
-        ends = jax.tree.map(
-            lambda all_, some: all_.at[jnp.where(done, problem, size)].set(some, mode="drop"), ends, states
-        )
-        problem = jnp.where(done, jnp.minimum(following + jnp.cumsum(done) - 1, size), problem)
-        fresh = take(start, jnp.minimum(problem, size - 1))
+        target = jnp.where(done, problem, size)
+        ends = jax.tree.map(lambda all_, some: all_.at[target].set(some, mode="drop"), ends, states)
+        place = jnp.where(done, jnp.minimum(following + jnp.cumsum(done) - 1, size), place)
+        fresh = jax.tree.map(lambda leaf: leaf[ask(place)], start)
         states = jax.tree.map(lambda new, old: jnp.where(_spread(done, new), new, old), fresh, states)
-        return problem, following + jnp.sum(done), states, ends
+        return place, following + jnp.sum(done), states, ends
 
     first = jnp.arange(lanes)
-    return jax.lax.while_loop(busy, advance, (first, jnp.array(lanes), take(start, first), start))[3]
+    states = jax.tree.map(lambda leaf: leaf[queue[:lanes]], start)
+    return jax.lax.while_loop(busy, advance, (first, jnp.array(lanes), states, start))[3]
 
 
 def _spread(flags: Array, leaf: Array) -> Array:

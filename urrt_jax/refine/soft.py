@@ -66,6 +66,12 @@ class Softened(NamedTuple):
     iterations: Array
 
 
+class _Normals(NamedTuple):
+    source: Array
+    target: Array
+    missing: Array
+
+
 class _Progress(NamedTuple):
     transform: Rigid
     widths: Array
@@ -91,7 +97,9 @@ def soften(
       tolerance: radians and lengths that the last step may still move.
     """
     unit = jnp.maximum(spacing, 1e-6)  # points may all coincide
-    sides = _side(source, target, rigid.inverse(initial), unit), _side(target, source, initial, unit)
+    sides = _sides(source, target, initial, unit)
+    # Without need nobody asks for these: what differentiates, below, is computed for derivatives alone.
+    loose = _sides_where(needed, source, target, initial, unit)
 
     def unfinished(now: _Progress) -> Array:
         return ~now.settled & (now.iteration < iterations)
@@ -107,7 +115,7 @@ def soften(
         return _Progress(move(_EAGER * motion, now.transform), widths, still & steady & paired, now.iteration + 1)
 
     begin = _Progress(initial, jnp.array(_BEGIN, unit.dtype) * unit, ~needed, jnp.array(0))
-    end = while_each(unfinished, step, begin, jax.lax.stop_gradient((*sides, unit)))
+    end = while_each(unfinished, step, begin, (*loose, unit))
 
     def imbalance(rest: Array) -> Array:
         widths = end.widths * jnp.exp(rest[6:])
@@ -122,6 +130,22 @@ def soften(
         tangent_solve=lambda linear, value: damped_solve(jax.jacobian(linear)(value), value),
     )
     return Softened(move(rest[:6], end.transform), end.settled, end.iteration)
+
+
+def _sides(source: Cloud, target: Cloud, initial: Rigid, unit: Array) -> tuple[Side, Side]:
+    return _side(source, target, rigid.inverse(initial), unit), _side(target, source, initial, unit)
+
+
+def _sides_where(needed: Array, source: Cloud, target: Cloud, initial: Rigid, unit: Array) -> tuple[Side, Side]:
+    """``_sides`` without derivatives where they are needed, normals of 0 elsewhere: they take as long as iterations."""
+
+    def look(clouds: tuple[Cloud, Cloud, Rigid, Array], _: _Normals) -> _Normals:
+        source, target = _sides(*clouds)
+        return _Normals(source.normals, target.normals, jnp.array(False))
+
+    blank = _Normals(jnp.zeros_like(source.points), jnp.zeros_like(target.points), needed)
+    found = while_each(lambda now: now.missing, look, blank, (source, target, initial, unit))
+    return Side(source, found.source), Side(target, found.target)
 
 
 def _side(cloud: Cloud, other: Cloud, moved: Rigid, unit: Array) -> Side:
