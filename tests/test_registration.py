@@ -1,5 +1,6 @@
 """The one call: what it recovers, what it is invariant to, how it says that it failed."""
 
+import dataclasses
 import subprocess
 import sys
 import textwrap
@@ -39,6 +40,50 @@ def call(small_model):
 
 
 @pytest.fixture(scope="module")
+def jitted(small_model):
+    """``register`` under jit, of two clouds, both masks and the inlier distance: one program for all who ask."""
+
+    @jax.jit
+    def register_jitted(source, target, source_mask, target_mask, inlier_distance):
+        masks = {"source_mask": source_mask, "target_mask": target_mask}
+        return register(source, target, **masks, inlier_distance=inlier_distance, model=small_model)
+
+    def run(source, target, *, source_mask=None, target_mask=None, inlier_distance=0.1):
+        masks = (
+            np.ones(len(points), bool) if mask is None else mask
+            for points, mask in ((source, source_mask), (target, target_mask))
+        )
+        return register_jitted(source, target, *masks, inlier_distance)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def batched(small_model):
+    """``register`` of three pairs at a time."""
+    return jax.jit(jax.vmap(lambda source, target: register(source, target, model=small_model)))
+
+
+def _padded(points, count=223, fill=0.0):
+    """The cloud with rows of padding behind it, and its mask."""
+    rows = np.full((count - len(points), 3), fill, points.dtype)
+    return np.concatenate([points, rows]), np.arange(count) < len(points)
+
+
+@pytest.fixture(scope="module")
+def call_padded(call):
+    """``call`` of clouds padded to 223 points, with these numbers in the padding."""
+
+    def run(source, target, *, fills=(0.0, 0.0)):
+        (source, source_mask), (target, target_mask) = (
+            _padded(points, fill=fill) for points, fill in zip((source, target), fills, strict=True)
+        )
+        return call(source, target, source_mask=source_mask, target_mask=target_mask)
+
+    return run
+
+
+@pytest.fixture(scope="module")
 def target(cloud, pose) -> np.ndarray:
     return (cloud @ pose[0].T + pose[1]).astype(np.float32)
 
@@ -67,6 +112,15 @@ def test_clean_pair_converges_with_full_fitness(plain):
 def test_network_alone_is_not_the_answer(plain, pose):
     """Otherwise the tests of refinement here would test nothing."""
     assert _angle(plain.coarse.rotation, pose[0]) > 0.02
+
+
+def test_refinement_starts_after_two_steps_of_the_network(call, small_config, make_model, cloud, target):
+    patient = make_model(dataclasses.replace(small_config, steps=3))
+    two, three = (call(cloud, target, model=model, refine=None) for model in (patient.at_most(2), patient))
+    assert _angle(two.rotation, three.rotation) > 1e-3
+    coarse = call(cloud, target, model=patient).coarse
+    np.testing.assert_allclose(coarse.rotation, two.rotation, atol=1e-6)
+    np.testing.assert_allclose(coarse.translation, two.translation, atol=1e-6)
 
 
 def test_without_refinement_the_answer_is_the_network_s(call, cloud, target, plain):
@@ -156,32 +210,22 @@ def test_every_real_dtype_gives_the_rotation_in_float32(call, cloud, target, pos
     assert _angle(result.rotation, pose[0]) < 0.02
 
 
-@pytest.mark.parametrize("which", ["source", "target"])
-def test_padding_changes_nothing(call, cloud, target, plain, which):
-    clouds = {"source": cloud, "target": target}
-    padded = np.concatenate([clouds[which], np.full((23, 3), 1e4, np.float32)])
-    result = call(**(clouds | {which: padded, f"{which}_mask": np.arange(223) < 200}))
+@pytest.mark.parametrize("fills", [(1e4, 0.0), (0.0, 1e4), (np.nan, np.inf)], ids=["source", "target", "not finite"])
+def test_padding_changes_nothing(call_padded, cloud, target, plain, fills):
+    result = call_padded(cloud, target, fills=fills)
     _same(result, plain)
     assert float(result.fitness) == pytest.approx(float(plain.fitness))
 
 
-def test_padding_may_be_nan(call, cloud, target, plain):
-    padded = np.concatenate([cloud, np.full((23, 3), np.nan, np.float32)])
-    _same(call(padded, target, source_mask=np.arange(223) < 200), plain)
+def test_padding_of_float64_clouds_may_be_anything(call_padded, cloud, target, plain):
+    _same(call_padded(cloud.astype(np.float64), target, fills=(1e12, 0.0)), plain)
 
 
-def test_padding_of_float64_clouds_may_be_anything(call, cloud, target, plain):
-    padded = np.concatenate([cloud.astype(np.float64), np.full((23, 3), 1e12)])
-    _same(call(padded, target, source_mask=np.arange(223) < 200), plain)
-
-
-def test_regions_have_one_label_a_point_and_zero_at_padding(call, cloud, target):
-    padded = np.concatenate([cloud, np.ones((23, 3), np.float32)])
-    result = call(padded, target, source_mask=np.arange(223) < 200)
-    assert result.source_regions.shape == (223,)
-    assert result.target_regions.shape == (200,)
-    np.testing.assert_array_equal(result.source_regions[200:], 0)
+def test_regions_have_one_label_a_point_and_zero_at_padding(call_padded, cloud, target):
+    result = call_padded(cloud, target, fills=(1.0, 1.0))
     for labels in (result.source_regions, result.target_regions):
+        assert labels.shape == (223,)
+        np.testing.assert_array_equal(labels[200:], 0)
         assert 0 <= int(labels.min()) <= int(labels.max()) < 4
 
 
@@ -190,49 +234,41 @@ def test_several_regions_are_in_use(plain):
     assert len(np.unique(plain.source_regions)) > 1
 
 
-def test_jit_agrees_with_eager(small_model, cloud, target, plain):
-    _same(jax.jit(lambda s, t: register(s, t, model=small_model))(cloud, target), plain, atol=1e-5)
+def test_jit_agrees_with_eager(jitted, cloud, target, plain):
+    _same(jitted(cloud, target), plain, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def batch(cloud, target, make_cloud_points):
+    """Three pairs: a batch as long as a rotation, so that a wrong transpose would fit."""
     other = make_cloud_points(7)
     turn = Rotation.from_rotvec([0.1, -0.05, 0.1]).as_matrix()
-    return np.stack([cloud, other]), np.stack([target, (other @ turn.T).astype(np.float32)])
+    return np.stack([cloud, other, target]), np.stack([target, (other @ turn.T).astype(np.float32), cloud])
 
 
 @pytest.fixture(scope="module")
-def together(batch, small_model):
-    return jax.vmap(lambda s, t: register(s, t, model=small_model))(*batch)
+def together(batched, batch):
+    return batched(*batch)
 
 
 def test_vmap_agrees_with_a_loop(call, batch, together):
-    for i in range(2):
+    for i in range(3):
         _same(jax.tree.map(lambda leaf, i=i: leaf[i], together), call(batch[0][i], batch[1][i]))
 
 
 def test_batched_matrix_is_one_matrix_a_pair(together):
     matrix = np.asarray(together.matrix)
-    assert matrix.shape == (2, 4, 4)
+    assert matrix.shape == (3, 4, 4)
     np.testing.assert_array_equal(matrix[:, :3, :3], together.rotation)
     np.testing.assert_array_equal(matrix[:, :3, 3], together.translation)
-    np.testing.assert_array_equal(matrix[:, 3], [[0, 0, 0, 1]] * 2)
+    np.testing.assert_array_equal(matrix[:, 3], [[0, 0, 0, 1]] * 3)
 
 
 def test_batched_apply_moves_every_cloud_by_its_own_transform(batch, together):
     moved = together.apply(batch[0])
-    for i in range(2):
+    for i in range(3):
         expected = batch[0][i] @ np.asarray(together.rotation[i]).T + np.asarray(together.translation[i])
         np.testing.assert_allclose(moved[i], expected, atol=1e-5)
-
-
-def test_batched_apply_of_three_pairs_is_not_mixed_up(cloud, pose, plain):
-    """Three pairs make the batch as long as a rotation, so that a wrong transpose fits."""
-    turns = np.stack([Rotation.from_rotvec([0.1 * i, 0.2, -0.3]).as_matrix() for i in range(3)]).astype(np.float32)
-    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), plain)
-    stacked = type(plain)(**{**vars(stacked), "rotation": jnp.asarray(turns), "translation": jnp.zeros((3, 3))})
-    moved = stacked.apply(np.stack([cloud] * 3))
-    np.testing.assert_allclose(moved, np.stack([cloud @ turn.T for turn in turns]), atol=1e-5)
 
 
 def test_batched_transform_agrees_with_the_batched_matrix(together):
@@ -240,13 +276,14 @@ def test_batched_transform_agrees_with_the_batched_matrix(together):
 
 
 def test_padded_batch_agrees_with_a_loop(call, small_model, cloud, target, plain):
-    points, mask = pad_clouds([cloud, cloud[:150]])
-    goals, goal_mask = pad_clouds([target, target])
+    points, mask = pad_clouds([cloud, cloud[:150]], size=223)
+    goals, goal_mask = pad_clouds([target, target], size=223)
     results = jax.vmap(lambda s, t, m, k: register(s, t, source_mask=m, target_mask=k, model=small_model))(
         points, goals, mask, goal_mask
     )
     _same(jax.tree.map(lambda leaf: leaf[0], results), plain)
-    _same(jax.tree.map(lambda leaf: leaf[1], results), call(cloud[:150], target))
+    alone = call(points[1], goals[1], source_mask=mask[1], target_mask=goal_mask[1])
+    _same(jax.tree.map(lambda leaf: leaf[1], results), alone)
 
 
 def test_matrix_transform_and_apply_agree(plain, cloud, target):
@@ -256,13 +293,14 @@ def test_matrix_transform_and_apply_agree(plain, cloud, target):
     np.testing.assert_allclose(plain.transform.apply(jnp.asarray(cloud)), plain.apply(cloud), atol=1e-5)
 
 
-def test_correspondences_are_the_nearest_points_within_the_inlier_distance(small_model, cloud, target):
+def test_correspondences_are_the_nearest_points_within_the_inlier_distance(call_padded, cloud, target):
     half = target[:100]
-    result = register(cloud, half, model=small_model)
+    result = call_padded(cloud, half)
     distance, row = cKDTree(half).query(result.apply(cloud))
     inlier = distance < float(result.inlier_distance)
     assert 0 < inlier.sum() < len(cloud)
-    np.testing.assert_array_equal(result.correspondences, np.where(inlier, row, -1))
+    np.testing.assert_array_equal(result.correspondences[:200], np.where(inlier, row, -1))
+    np.testing.assert_array_equal(result.correspondences[200:], -1)
     assert float(result.fitness) == pytest.approx(inlier.mean())
 
 
@@ -294,29 +332,35 @@ def apart(cloud) -> np.ndarray:
     return kept
 
 
-@pytest.mark.parametrize("moves", ["source", "target"])
-def test_refined_pose_derivative_agrees_with_finite_differences(small_model, apart, pose, moves):
+def test_refined_pose_derivative_agrees_with_finite_differences(small_model, apart, pose):
     """Noise on the target, so that the fit is not perfect; the points lie so far apart that correspondences hold."""
     rng = np.random.default_rng(0)
     noisy = apart @ pose[0].T + pose[1] + 0.01 * rng.normal(size=apart.shape)
     points = {"source": jnp.asarray(apart), "target": jnp.asarray(noisy, jnp.float32)}
     along = jnp.asarray(rng.normal(size=apart.shape), jnp.float32)
     turning, shifting = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(3, 3), (3,)])
-    exact = ICP(plane=0.0, tolerance=3e-7)  # normals change when a neighbourhood does; tests/refine has them
+    # Normals change when a neighbourhood does, and so does the soft end: tests/refine has both.
+    exact = ICP(plane=0.0, soft_points=0, tolerance=3e-7)
 
-    @jax.jit
-    def values(step):
-        result = register(**(points | {moves: points[moves] + step * along}), model=small_model, refine=exact)
+    def values(steps):
+        """Of a step of the source and one of the target."""
+        moved = {name: points[name] + step * along for name, step in zip(points, steps, strict=True)}
+        result = register(**moved, model=small_model, refine=exact)
         return jnp.stack([jnp.sum(result.rotation * turning), jnp.sum(result.translation * shifting)])
 
-    step = 1e-4  # little against the noise, which the width of the weights follows
-    difference = (values(step) - values(-step)) / (2 * step)
-    np.testing.assert_allclose(jax.jacrev(values)(0.0), difference, rtol=0.02, atol=5e-3)
+    step = 1e-4 * jnp.eye(2)  # little against the noise, which the width of the weights follows
+    valued = jax.jit(values)
+    differences = [(valued(each) - valued(-each)) / 2e-4 for each in step]
+    np.testing.assert_allclose(
+        jax.jit(jax.jacrev(values))(jnp.zeros(2)), jnp.stack(differences, axis=1), rtol=0.02, atol=5e-3
+    )
 
 
 def test_derivative_of_the_translation_follows_a_moved_cloud(small_model, cloud, target):
-    jacobian = jax.jacobian(
-        lambda offset: register(jnp.asarray(cloud), jnp.asarray(target) + offset, model=small_model).translation
+    jacobian = jax.jit(
+        jax.jacrev(
+            lambda offset: register(jnp.asarray(cloud), jnp.asarray(target) + offset, model=small_model).translation
+        )
     )(jnp.zeros(3))
     np.testing.assert_allclose(jacobian, np.eye(3), atol=1e-3)
 
@@ -326,7 +370,7 @@ def test_network_alone_differentiates_in_the_parameters(small_model, cloud, targ
         model = Model(small_model.config, params)
         return jnp.sum(register(jnp.asarray(cloud), jnp.asarray(target), model=model, refine=None).rotation)
 
-    gradient = jax.grad(total)(small_model.params)
+    gradient = jax.jit(jax.grad(total))(small_model.params)
     leaves = jax.tree.leaves(gradient["decoder"]) + jax.tree.leaves(gradient["encoder"])
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
     assert any(bool(jnp.any(leaf)) for leaf in leaves)
@@ -338,16 +382,22 @@ _CUBE = np.stack(np.meshgrid(*[np.linspace(-1, 1, 6)] * 3), -1).reshape(-1, 3)
 _CUBE = _CUBE[np.abs(_CUBE).max(1) > 0.99].astype(np.float32)
 
 
-@pytest.mark.parametrize("refine", [None, ICP()], ids=["network", "icp"])
-@pytest.mark.parametrize("points", [_SPHERE, _CUBE, _CUBE * [1, 1, 0]], ids=["sphere", "cube", "square"])
-def test_gradient_is_finite_for_equal_symmetric_clouds(small_model, points, refine):
-    points = jnp.asarray(points, jnp.float32)
+@pytest.fixture(scope="module", params=[None, ICP()], ids=["network", "icp"])
+def gradient_onto_itself(request, small_model):
+    """The gradient in a source that equals its target: of 200 points and their mask."""
 
-    def total(source):
-        result = register(source, points, model=small_model, refine=refine)
+    def total(source, target, mask):
+        masks = {"source_mask": mask, "target_mask": mask}
+        result = register(source, target, **masks, model=small_model, refine=request.param)
         return jnp.sum(result.rotation * jnp.arange(9.0).reshape(3, 3)) + jnp.sum(result.translation) + result.rmse
 
-    assert bool(jnp.all(jnp.isfinite(jax.jit(jax.grad(total))(points))))
+    gradient = jax.jit(jax.grad(total))
+    return lambda points, mask: gradient(points, points, mask)
+
+
+@pytest.mark.parametrize("points", [_SPHERE, _CUBE, _CUBE * [1, 1, 0]], ids=["sphere", "cube", "square"])
+def test_gradient_is_finite_for_equal_symmetric_clouds(gradient_onto_itself, points):
+    assert bool(jnp.all(jnp.isfinite(gradient_onto_itself(*_padded(points.astype(np.float32), 200)))))
 
 
 def test_cloud_onto_itself_stays(call, cloud):
@@ -357,25 +407,26 @@ def test_cloud_onto_itself_stays(call, cloud):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_bad_points_under_jit_are_ignored(small_model, cloud, target, plain, bad):
+def test_bad_points_under_jit_are_ignored(jitted, cloud, target, plain, bad):
     spoilt = cloud.copy()
     spoilt[[3, 50], [0, 2]] = bad
-    result = jax.jit(lambda s, t: register(s, t, model=small_model))(spoilt, target)
+    result = jitted(spoilt, target)
     assert _finite(result)
     assert _angle(result.rotation, plain.rotation) < 5e-3
 
 
 @pytest.mark.parametrize("which", ["source", "target"])
-def test_cloud_of_nan_under_jit_is_finite_and_flagged(small_model, cloud, target, which):
+def test_cloud_of_nan_under_jit_is_finite_and_flagged(jitted, cloud, target, which):
     clouds = {"source": cloud, "target": target}
     clouds[which] = np.full((200, 3), np.nan, np.float32)
-    result = jax.jit(lambda c: register(**c, model=small_model))(clouds)
+    result = jitted(**clouds)
     assert _finite(result)
     assert not bool(result.converged)
 
 
-def test_masked_out_cloud_under_jit_is_finite_and_flagged(small_model, cloud, target):
-    result = jax.jit(lambda m: register(cloud, target, source_mask=m, model=small_model))(np.zeros(200, bool))
+@pytest.mark.parametrize("which", ["source_mask", "target_mask"])
+def test_masked_out_cloud_under_jit_is_finite_and_flagged(jitted, cloud, target, which):
+    result = jitted(cloud, target, **{which: np.zeros(200, bool)})
     assert _finite(result)
     assert not bool(result.converged)
 
@@ -389,13 +440,12 @@ def test_collinear_clouds_along_an_axis_are_flagged(call, cloud, which):
     assert not bool(result.converged)
 
 
-def test_collinear_clouds_in_any_direction_are_flagged(small_model):
+def test_collinear_clouds_in_any_direction_are_flagged(batched):
     rng = np.random.default_rng(0)
-    directions = rng.normal(size=(20, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    lines = (np.linspace(-1, 1, 50)[None, :, None] * directions[:, None]).astype(np.float32)
-    results = jax.jit(jax.vmap(lambda line: register(line, line, model=small_model)))(lines)
-    assert int(jnp.sum(results.converged)) == 0
+    directions = rng.normal(size=(7, 3, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    lines = (np.linspace(-1, 1, 200)[:, None] * directions[:, :, None]).astype(np.float32)
+    assert not any(bool(jnp.any(batched(three, three).converged)) for three in lines)
 
 
 def test_planar_clouds_are_not_flagged(call, cloud):
@@ -416,7 +466,7 @@ def test_unrelated_clouds_are_not_called_converged(call):
 
 
 def test_cloud_of_two_far_blobs_is_registered(call, cloud, pose):
-    source = np.concatenate([cloud, 0.5 * cloud[:100] + np.float32(8)])
+    source = np.concatenate([cloud[:140], 0.5 * cloud[:60] + np.float32(8)])
     moved = (source @ pose[0].T + pose[1]).astype(np.float32)
     result = call(source, moved)
     assert _angle(result.rotation, pose[0]) < 1e-3
@@ -425,7 +475,7 @@ def test_cloud_of_two_far_blobs_is_registered(call, cloud, pose):
 
 def test_every_point_given_twice_changes_nothing(call, cloud, target, pose):
     """As the corners of a triangle soup are."""
-    result = call(np.repeat(cloud, 2, axis=0), np.repeat(target, 2, axis=0))
+    result = call(np.repeat(cloud[::2], 2, axis=0), np.repeat(target[::2], 2, axis=0))
     assert _angle(result.rotation, pose[0]) < 1e-3
     assert bool(result.converged)
 
@@ -499,8 +549,8 @@ def test_default_inlier_distance_is_one_and_a_half_spacings(plain, cloud):
     assert float(plain.inlier_distance) == pytest.approx(1.5 * spacing, rel=1e-3)
 
 
-def test_inlier_distance_may_be_traced(small_model, cloud, target):
-    result = jax.jit(lambda d: register(cloud, target, model=small_model, inlier_distance=d))(0.07)
+def test_inlier_distance_may_be_traced(jitted, cloud, target):
+    result = jitted(cloud, target, inlier_distance=0.07)
     assert float(result.inlier_distance) == pytest.approx(0.07, rel=1e-5)
 
 
@@ -551,10 +601,10 @@ def test_one_stray_point_does_not_move_the_inlier_distance(small_model, cloud, r
     assert float(spoiled.inlier_distance) == pytest.approx(float(plain.inlier_distance), rel=0.1)
 
 
-def test_host_batch_applies_every_transform_to_its_own_cloud(small_model, cloud):
+def test_host_batch_applies_every_transform_to_its_own_cloud(batched, cloud):
     """Three clouds of three points, where a shift along the wrong axis would go unnoticed by the shapes."""
     sources = np.stack([cloud, cloud + 1, cloud + 2])
-    batch = jax.vmap(lambda a: register(a, cloud, model=small_model))(sources)
+    batch = batched(sources, np.stack([cloud] * 3))
     host = jax.device_get(batch)
     np.testing.assert_allclose(host.apply(sources[:, :3]), batch.apply(sources[:, :3]), atol=1e-5)
     assert host.matrix.shape == (3, 4, 4)

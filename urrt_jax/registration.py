@@ -31,6 +31,7 @@ from urrt_jax.search import search as find_pose
 from urrt_jax.weights import load_model
 
 _LARGEST = 1e15
+_STEPS_BEFORE_REFINEMENT = 2  # of the network: after a third one refinement ends where it ends after two
 
 
 @jax.tree_util.register_dataclass
@@ -60,7 +61,8 @@ class Registration:
         motions (translation, rotation vector) about the target's origin; what pose graphs take (Choi et al. 2015).
       source_regions: (N,) int32, the region of every source point (as aligned); 0 for padding and for model A.
       target_regions: (M,) int32, the same for the target.
-      coarse: the network's own estimate, before refinement.
+      coarse: the network's own estimate: after two steps where refinement follows, which needs no better one, after
+        all that it was trained for where none does.
       steps: refinement's iterations in its last stage; 0 without refinement.
     """
 
@@ -160,6 +162,8 @@ def register(
     if known and not np.all(np.asarray(inlier_distance) > 0):
         raise ValueError(f"inlier_distance: expected a positive length, got {inlier_distance}")
     model = load_model() if model is None else model
+    if refine is not None:
+        model = model.at_most(_STEPS_BEFORE_REFINEMENT)
     source, source_origin = _near_origin(source, source_mask, "source")
     target, target_origin = _near_origin(target, target_mask, "target")
     first = None if search == "auto" else search
@@ -171,7 +175,9 @@ def register(
 
 def _near_origin(points: ArrayLike, mask: ArrayLike | None, name: str) -> tuple[Array, np.ndarray | None]:
     """The points as float32 and the origin (3,) that was subtracted; only host arrays of more digits need one."""
-    if isinstance(points, jax.Array) or getattr(points, "dtype", None) == np.float32:
+    if isinstance(points, jax.Array):  # one compiled program for all short dtypes
+        return points.astype(jnp.promote_types(points.dtype, jnp.float32)), None
+    if getattr(points, "dtype", None) == np.float32:
         return jnp.asarray(points), None
     values = np.asarray(points, np.float64)
     real = values if mask is None or isinstance(mask, Tracer) else values[np.asarray(mask, bool)]

@@ -254,13 +254,13 @@ def test_derivatives_of_a_degenerate_cloud_are_finite(shape, angle, x64):
 @pytest.mark.parametrize("plane", [0.0, 0.97])
 def test_single_precision_stays_so_where_double_precision_is_on(plane, x64):
     cloud = make_cloud(jnp.asarray(_surface(60), jnp.float32))
-    config = ICP(plane=plane, iterations=3)
+    config = ICP(plane=plane)
 
     def shift(points):
         found = icp(cloud._replace(points=points), cloud, rigid.identity(), config).transform
         return jnp.sum(found.translation), found
 
-    gradient, found = jax.jit(jax.grad(shift, has_aux=True), compiler_options=_HASTY)(cloud.points)
+    gradient, found = jax.eval_shape(jax.grad(shift, has_aux=True), cloud.points)
     assert {leaf.dtype for leaf in (*found, gradient)} == {jnp.dtype("float32")}
 
 

@@ -31,6 +31,10 @@ class Model:
     config: ModelConfig = dataclasses.field(metadata={"static": True})
     params: dict
 
+    def at_most(self, steps: int) -> "Model":
+        """The same network, applied as often as before but not more often than this."""
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, steps=min(steps, self.config.steps)))
+
 
 class Estimate(NamedTuple):
     """The network's answer for one pair, in the frame of its input.

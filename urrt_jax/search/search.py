@@ -1,6 +1,5 @@
 """The search itself: hypotheses, their scores, the best few refined, the best of those."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -118,7 +117,7 @@ def _from_features(
 
 def _from_network(model: Model, source: Cloud, target: Cloud, rotations: int) -> Rigid:
     """The network's estimates after one step, with the source turned by every member of the cover."""
-    once = dataclasses.replace(model, config=dataclasses.replace(model.config, steps=1))
+    once = model.at_most(1)
 
     def at(rotation: Array) -> Rigid:
         return estimate(once, source, target, Rigid(rotation, jnp.zeros(3))).transform
