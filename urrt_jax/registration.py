@@ -31,7 +31,7 @@ from urrt_jax.search import search as find_pose
 from urrt_jax.weights import load_model
 
 _LARGEST = 1e15
-_STEPS_BEFORE_REFINEMENT = 2  # of the network: after a third one refinement ends where it ends after two
+STEPS_BEFORE_REFINEMENT = 2  # of the network, at most: refinement does the rest
 
 
 @jax.tree_util.register_dataclass
@@ -61,8 +61,8 @@ class Registration:
         motions (translation, rotation vector) about the target's origin; what pose graphs take (Choi et al. 2015).
       source_regions: (N,) int32, the region of every source point (as aligned); 0 for padding and for model A.
       target_regions: (M,) int32, the same for the target.
-      coarse: the network's own estimate: after two steps where refinement follows, which needs no better one, after
-        all that it was trained for where none does.
+      coarse: the network's own estimate: after at most two steps where refinement follows, which does the rest, and
+        after as many as its configuration says where none does.
       steps: refinement's iterations in its last stage; 0 without refinement.
     """
 
@@ -134,7 +134,8 @@ def register(
       source_mask: (N,) bool, False for padding; None when every point is real.
       target_mask: (M,) bool.
       model: the network; the packaged one by default (``load_model``).
-      refine: how to refine; None returns the network's estimate, or the search's. Static under jit.
+      refine: how to refine, after at most two of the network's steps; None returns the network's estimate after all of
+        them, or the search's. Static under jit.
       search: how to look for the pose among all poses (``Search()``); "auto" does so only where the plain result has
         not converged, and always under jit and vmap, where that can't be seen; None never does. Static under jit.
       inlier_distance: the distance that defines ``fitness`` and ``rmse``, in the input's units; by default 1.5 times
@@ -163,7 +164,7 @@ def register(
         raise ValueError(f"inlier_distance: expected a positive length, got {inlier_distance}")
     model = load_model() if model is None else model
     if refine is not None:
-        model = model.at_most(_STEPS_BEFORE_REFINEMENT)
+        model = model.at_most(STEPS_BEFORE_REFINEMENT)
     source, source_origin = _near_origin(source, source_mask, "source")
     target, target_origin = _near_origin(target, target_mask, "target")
     first = None if search == "auto" else search
@@ -175,10 +176,9 @@ def register(
 
 def _near_origin(points: ArrayLike, mask: ArrayLike | None, name: str) -> tuple[Array, np.ndarray | None]:
     """The points as float32 and the origin (3,) that was subtracted; only host arrays of more digits need one."""
-    if isinstance(points, jax.Array):  # one compiled program for all short dtypes
-        return points.astype(jnp.promote_types(points.dtype, jnp.float32)), None
-    if getattr(points, "dtype", None) == np.float32:
-        return jnp.asarray(points), None
+    if isinstance(points, jax.Array) or getattr(points, "dtype", None) == np.float32:
+        near = jnp.asarray(points)
+        return near.astype(jnp.promote_types(near.dtype, jnp.float32)), None  # one program for all short dtypes
     values = np.asarray(points, np.float64)
     real = values if mask is None or isinstance(mask, Tracer) else values[np.asarray(mask, bool)]
     origin = real[np.all(np.isfinite(real), axis=-1)].mean(axis=0)

@@ -35,6 +35,7 @@ from urrt_jax.model.encoding import encode_cloud
 from urrt_jax.model.landmarks import place_landmarks
 from urrt_jax.model.network import estimate
 from urrt_jax.refine import icp
+from urrt_jax.registration import STEPS_BEFORE_REFINEMENT
 
 HERE = Path(__file__).parent
 BATCH = 64
@@ -52,7 +53,7 @@ def measure(data: str) -> dict:
     sources, targets = (
         jnp.asarray(np.stack(each)) for each in list(zip(*(trial[:2] for trial in trials), strict=True))
     )
-    model = load_model().at_most(2)  # as often as ``register`` applies it before refinement
+    model = load_model().at_most(STEPS_BEFORE_REFINEMENT)
     config, params = model.config, model.params
 
     @jax.vmap
@@ -103,7 +104,7 @@ def measure(data: str) -> dict:
         "normalise, spacing": milliseconds(ready, sources, targets),
         "farthest points": milliseconds(smaller, prepared),
         "surroundings of both clouds": milliseconds(surroundings, small),
-        "the network's two steps": milliseconds(estimated, *small),
+        "the network's steps": milliseconds(estimated, *small),
         "– of a step: encode the source, its own lookups": milliseconds(encoding, small[0], invariants[0]),
         "– of a step: place the other landmarks, in both clouds": 2 * place,
         "– of a step: consensus": milliseconds(agreeing, landmarks, others, jnp.ones(landmarks.shape[:2])),
