@@ -6,7 +6,7 @@ from jax import Array
 
 from urrt_jax.geometry.clouds import Cloud
 
-_BLOCK = 16
+_BLOCK = 8
 _HIGHEST = jax.lax.Precision.HIGHEST
 _SINGULAR = 1e-4  # what rounding leaves of a cross product of rows of size 1 that should vanish
 
