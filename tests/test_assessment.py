@@ -55,6 +55,15 @@ def test_overlap_of_clouds_far_apart_is_nothing():
     assert _fit(_sheet(0, 2), _sheet(1, 3), far).shares.tolist() == [[0] * 3] * 2
 
 
+def test_neighbours_are_looked_for_as_far_as_asked():
+    away = Rigid(jnp.eye(3), jnp.array([0.0, 0.0, 0.45]))
+    near, far = (jax.jit(fit)(_sheet(0, 2), _sheet(0, 2), away, reach) for reach in (0.0, 0.46))
+    real = np.asarray(_sheet(0, 2).mask)
+    assert not np.isfinite(near.squared).any()
+    np.testing.assert_allclose(np.sqrt(far.squared[real]), 0.45, rtol=1e-5)
+    np.testing.assert_array_equal(near.shares, far.shares)
+
+
 def test_shares_grow_with_their_distances(cloud):
     shares = _fit(_padded(cloud), _padded(cloud + np.float32(0.05)), _turn(10)).shares
     assert bool(jnp.all(jnp.diff(shares, axis=1) > 0))
@@ -68,7 +77,7 @@ def test_swapping_the_clouds_swaps_the_shares(cloud):
 
 def test_squared_distances_are_those_of_the_nearest_and_infinite_for_padding(cloud):
     source, target, transform = _padded(cloud[::2]), _padded(cloud[50:]), _turn(5)
-    found = _fit(source, target, transform)
+    found = _fit(source, target, transform, 10.0)
     apart = rigid.apply(transform, source.points) - target.points[found.nearest]
     expected = np.where(source.mask, np.sum(np.square(apart), axis=1), np.inf)
     np.testing.assert_allclose(found.squared, expected, rtol=1e-4, atol=1e-9)

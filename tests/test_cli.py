@@ -129,6 +129,18 @@ def test_no_refine_gives_the_networks_own_estimate(files, capsys):
     np.testing.assert_allclose(found["rotation"], expected.coarse.rotation, atol=1e-5)
 
 
+def test_what_json_printed_is_a_rough_transform_to_begin_with(files, capsys, tmp_path):
+    assert register(files, "--json", "--no-refine") == 0
+    rough = tmp_path / "rough.json"
+    rough.write_text(capsys.readouterr().out)
+    assert register(files, "--json", "--initial", str(rough)) == 0
+    found = json.loads(capsys.readouterr().out)
+    clouds = [io.read_cloud(files[name]) for name in ("a.ply", "b.xyz")]
+    options = {"model": urrt_jax.load_model(files["model.npz"]), "search": "auto"}
+    expected = urrt_jax.register(*clouds, **options, initial=np.array(json.loads(rough.read_text())["matrix"]))
+    np.testing.assert_allclose(found["matrix"], expected.matrix, atol=1e-5)
+
+
 def test_picture_is_a_png(files, capsys, tmp_path):
     assert register(files, "--picture", str(tmp_path / "pair.png")) == 0
     assert (tmp_path / "pair.png").read_bytes().startswith(b"\x89PNG")
@@ -142,8 +154,9 @@ def test_picture_is_a_png(files, capsys, tmp_path):
         ({}, ["--out", "moved.docx"]),
         ({}, ["--inlier-distance", "-1"]),
         ({}, ["--out", "no-such-folder/moved.ply"]),
+        ({}, ["--initial", "missing.txt"]),
     ],
-    ids=["missing file", "unknown model", "unknown extension", "negative distance", "missing folder"],
+    ids=["missing file", "unknown model", "unknown extension", "negative distance", "missing folder", "no transform"],
 )
 def test_a_mistake_is_one_line_on_stderr(files, capsys, tmp_path, monkeypatch, change, flags):
     monkeypatch.chdir(tmp_path)

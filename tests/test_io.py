@@ -1,3 +1,4 @@
+import json
 import sys
 from pathlib import Path
 
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from urrt_jax.io import read_cloud, read_mesh, sample_surface, write_cloud
+from urrt_jax.io import read_cloud, read_mesh, read_transform, sample_surface, write_cloud
 
 UTM = np.array([500_000.123456789, 5_400_000.987654321, 312.000000001])  # map coordinates, which need double precision
 
@@ -266,3 +267,50 @@ def test_pickled_objects_are_never_loaded(tmp_path):
     np.save(tmp_path / "cloud.npy", np.array([[{}, {}, {}]], dtype=object), allow_pickle=True)
     with pytest.raises(ValueError, match="allow_pickle=False"):
         read_cloud(tmp_path / "cloud.npy")
+
+
+_POSE = np.array([[0, -1, 0, 0.5], [1, 0, 0, -2], [0, 0, 1, 3e5], [0, 0, 0, 1]])
+
+
+def _write_transform(path):
+    match path.suffix:
+        case ".npy":
+            np.save(path, _POSE)
+        case ".json":
+            path.write_text(json.dumps({"matrix": _POSE.tolist(), "fitness": 1.0}))
+        case _:
+            path.write_text("# source to target\n" + "\n".join(" ".join(map(str, row)) for row in _POSE))
+    return path
+
+
+@pytest.mark.parametrize("name", ["pose.txt", "pose.npy", "pose.json"])
+def test_a_transform_is_read_back(tmp_path, name):
+    np.testing.assert_array_equal(read_transform(_write_transform(tmp_path / name)), _POSE)
+
+
+def test_a_transform_may_be_rows_of_json(tmp_path):
+    (tmp_path / "pose.json").write_text(json.dumps(_POSE.tolist()))
+    np.testing.assert_array_equal(read_transform(tmp_path / "pose.json"), _POSE)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("pose.txt", "1 0 0\n0 1 0\n0 0 1\n"),
+        ("pose.txt", "one two\n"),
+        ("pose.txt", "1 2 3 4\n5 6\n"),
+        ("pose.json", '{"fitness": 1}'),
+        ("pose.json", "[1, 2"),
+        ("pose.json", '[["a"]]'),
+        ("pose.npy", "text"),
+    ],
+)
+def test_what_is_no_transform_is_refused_by_name(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ValueError, match=name):
+        read_transform(tmp_path / name)
+
+
+def test_a_missing_transform_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"pose\.txt"):
+        read_transform(tmp_path / "pose.txt")

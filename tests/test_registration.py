@@ -123,6 +123,101 @@ def test_refinement_starts_after_two_steps_of_the_network(call, small_config, ma
     np.testing.assert_allclose(coarse.translation, two.translation, atol=1e-6)
 
 
+def _far(degrees=150.0) -> np.ndarray:
+    """A transform far from the identity, (4, 4) float64."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    matrix[:3, 3] = [3.0, -1.0, 2.0]
+    return matrix
+
+
+@pytest.fixture(scope="module")
+def far_target(cloud, pose) -> np.ndarray:
+    """The cloud moved far, and then by ``pose``."""
+    moved = cloud @ _far()[:3, :3].T + _far()[:3, 3]
+    return (moved @ pose[0].T + pose[1]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def begun(call, cloud, far_target) -> Registration:
+    return call(cloud, far_target, initial=_far())
+
+
+def test_a_rough_transform_is_what_registration_begins_with(call, cloud, far_target, pose, begun):
+    np.testing.assert_allclose(begun.rotation, pose[0] @ _far()[:3, :3], atol=1e-4)
+    np.testing.assert_allclose(begun.translation, pose[0] @ _far()[:3, 3] + pose[1], atol=1e-3)
+    assert bool(begun.converged)
+    without = call(cloud, far_target)
+    assert _angle(without.rotation, begun.rotation) > 0.3
+
+
+def test_beginning_somewhere_is_moving_the_source_there(call, cloud, far_target, begun):
+    moved = (cloud @ _far()[:3, :3].T + _far()[:3, 3]).astype(np.float32)
+    plain = call(moved, far_target)
+    np.testing.assert_allclose(begun.matrix, np.asarray(plain.matrix, np.float64) @ _far(), atol=1e-4)
+    np.testing.assert_array_equal(begun.correspondences, plain.correspondences)
+    np.testing.assert_allclose(begun.information, plain.information, rtol=1e-3, atol=1e-2)
+
+
+def test_a_rough_transform_that_lies_better_than_the_network_s_estimate_is_refined(call, cloud):
+    """Two parts that hardly overlap: their centres, all that the network is told of places, are far apart."""
+    source, target = cloud[cloud[:, 0] < 0.55], cloud[cloud[:, 0] > -0.25]
+    rough = np.eye(4)
+    rough[:3, :3], rough[:3, 3] = Rotation.from_rotvec([0.02, -0.03, 0.02]).as_matrix(), 0.02
+    assert _angle(call(source, target, initial=rough).rotation, np.eye(3)) < 1e-3
+
+
+def test_a_rough_transform_at_map_coordinates_costs_no_digits(call, cloud, far_target, begun):
+    here, there = np.array([5e5, 4e6, 100.0]), np.array([4e5, 5e6, -200.0])
+    initial = _far()
+    initial[:3, 3] += there - initial[:3, :3] @ here
+    found = call(cloud.astype(np.float64) + here, far_target.astype(np.float64) + there, initial=initial)
+    np.testing.assert_allclose(found.apply(cloud + here) - there, begun.apply(cloud), atol=1e-4)
+
+
+def test_each_pair_of_a_batch_begins_where_it_is_told(small_model, cloud, far_target, pose, begun):
+    initial = np.stack([_far(), np.eye(4)]).astype(np.float32)
+    targets = np.stack([far_target, (cloud @ pose[0].T + pose[1]).astype(np.float32)])
+    options = {"model": small_model}
+    found = jax.jit(jax.vmap(lambda target, start: register(cloud, target, initial=start, **options)))(targets, initial)
+    np.testing.assert_allclose(found.matrix[0], begun.matrix, atol=1e-3)
+    assert _angle(found.rotation[1], pose[0]) < 1e-3
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_rough_transform_that_is_not_finite_is_flagged_under_jit(small_model, cloud, target, bad):
+    spoiled = _far().astype(np.float32)
+    spoiled[0, 3] = bad
+    found = jax.jit(lambda start: register(cloud, target, initial=start, model=small_model))(spoiled)
+    assert _finite(found) and not bool(found.converged)
+
+
+def test_a_rotation_that_is_rounded_gives_a_rotation(call, cloud, far_target, begun):
+    rounded = np.round(_far(), 3)
+    found = call(cloud, far_target, initial=rounded).rotation
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-5)
+    assert _angle(found, begun.rotation) < 1e-3
+
+
+_SKEWED = np.array([[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("initial", "message"),
+    [
+        pytest.param(np.eye(3), r"expected shape \(4, 4\), got \(3, 3\)", id="a rotation"),
+        pytest.param(_SKEWED, "expected a rotation", id="sheared"),
+        pytest.param(np.diag([1.0, 1, -1, 1]), "expected a rotation", id="a reflection"),
+        pytest.param(np.diag([2.0, 2, 2, 1]), "expected a rotation", id="scaled"),
+        pytest.param(np.full((4, 4), np.nan), "expected a rotation", id="not finite"),
+        pytest.param(_far().T, "expected a rotation", id="transposed"),
+    ],
+)
+def test_a_rough_transform_that_is_not_rigid_is_refused(call, cloud, target, initial, message):
+    with pytest.raises(ValueError, match=f"^initial: {message}"):
+        call(cloud, target, initial=initial)
+
+
 def test_without_refinement_the_answer_is_the_network_s(call, cloud, target, plain):
     alone = call(cloud, target, refine=None)
     np.testing.assert_allclose(alone.rotation, plain.coarse.rotation, atol=1e-6)

@@ -18,6 +18,7 @@ from urrt_jax.geometry.rigid import Rigid, nearest_rotation
 _HIGHEST = jax.lax.Precision.HIGHEST
 _RINGS = (1.0, 1.5, 3.0)  # spacings of the coarser cloud: close, touching (samples of one surface do), and about
 _CLOSE, _TOUCHING, _ABOUT = range(3)
+_BEYOND = 1.001  # times the farthest distance that counts: what lies just there is seen
 _ASKED = 4096  # points of a large target
 _TURNED, _TURNED_ASKED = 512, 128  # points of a cloud that is turned, and of those that ask
 _QUARTER = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -33,8 +34,8 @@ class Fit(NamedTuple):
     """How a moved source lies on its target.
 
     Attributes:
-      squared: (N,), from every source point to the nearest target point; inf for padding.
-      nearest: (N,) int32, that point's row.
+      squared: (N,), from every source point to the nearest target point; inf for padding, and where none is near.
+      nearest: (N,) int32, that point's row, where there is one.
       touching: (), the distance within which points touch: 1.5 spacings of the coarser cloud.
       shares: (2, 3), of the source's points and of the target's: how many lie within 1, 1.5 and 3 spacings.
       uniqueness: (), from -1 to 1: how much more of both clouds agrees than after the best of some turns.
@@ -68,15 +69,21 @@ class Fit(NamedTuple):
         return jax.nn.sigmoid(BIAS + self.evidence @ jnp.array(list(ASSESSED.values())))
 
 
-def fit(source: Cloud | Prepared, target: Cloud | Prepared, transform: Rigid) -> Fit:
-    """The fit of the source, moved by ``transform``, on the target."""
+def fit(source: Cloud | Prepared, target: Cloud | Prepared, transform: Rigid, reach: Array | float = 0.0) -> Fit:
+    """The fit of the source, moved by ``transform``, on the target.
+
+    Neighbours are looked for within 3 spacings of the coarser cloud, or within ``reach``, where that is more.
+    """
     source, target = prepare(source), prepare(target)
     width = jax.lax.stop_gradient(jnp.maximum(source.spacing, target.spacing))
     mask = source.cloud.mask
-    index, squared = nearest(rigid.apply(transform, source.cloud.points), target.reference)
-    some = target.thin(_ASKED)
-    back = nearest(rigid.apply(rigid.inverse(transform), some.points), source.reference).squared
     rings = width * jnp.array(_RINGS)
+    within = _BEYOND * jnp.maximum(rings[_ABOUT], reach)
+    moved = rigid.apply(transform, source.cloud.points)
+    index, squared = nearest(moved, target.reference, within=within, order=source.order)
+    some = target.thin(_ASKED)
+    asked = rigid.apply(rigid.inverse(transform), some.points)
+    back = nearest(asked, source.reference, within=_BEYOND * rings[_ABOUT]).squared
     shares = [
         jax.vmap(lambda ring, mask=mask, squared=squared: inlier_share(mask, squared, ring)[0])(rings)
         for mask, squared in ((mask, squared), (some.mask, back))

@@ -1,4 +1,4 @@
-"""Reading and writing one point cloud or mesh.
+"""Reading and writing one point cloud or mesh, and reading a transform.
 
 Coordinates keep their digits: text and PLY are read and written in double precision, because a cloud in map
 coordinates (500,000 m) loses centimetres in single precision. Every complaint about a file is a `ValueError` that
@@ -8,6 +8,7 @@ names it.
 from __future__ import annotations
 
 import io
+import json
 import os
 import warnings
 from collections.abc import Callable
@@ -99,6 +100,34 @@ def read_geometry(path: str | os.PathLike[str]) -> trimesh.Trimesh | np.ndarray:
     if not mesh.area > 0:
         raise ValueError(f"{path}: its {len(faces)} faces have no area, so no point can be drawn on them")
     return mesh
+
+
+def read_transform(path: str | os.PathLike[str]) -> np.ndarray:
+    """The matrix (4, 4), float64, in a file: four rows of text (`#` starts a comment), a `.npy`, or a `.json`.
+
+    A `.json` holds the rows, or an object with a `matrix`, as `urrt register --json` prints it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it holds no (4, 4) matrix of numbers.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        if path.suffix.lower() == ".npy":
+            found = np.load(path, allow_pickle=False)
+        elif path.suffix.lower() == ".json":
+            content = json.loads(path.read_text())
+            found = content["matrix"] if isinstance(content, dict) else content
+        else:
+            found = np.loadtxt(path, ndmin=2)
+        matrix = np.asarray(found, np.float64)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: holds no matrix of 4 rows and 4 columns ({error})") from error
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{path}: expected a matrix of shape (4, 4), got {matrix.shape}")
+    return matrix
 
 
 def sample_surface(triangles: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -12,7 +12,7 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
-from urrt_jax.assessment import fit, information, inlier_share, moved_information, well_posed
+from urrt_jax.assessment import agreement, fit, information, inlier_share, moved_information, well_posed
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import (
     Cloud,
@@ -20,17 +20,19 @@ from urrt_jax.geometry.clouds import (
     denormalize_translation,
     make_cloud,
     normalize_pair,
+    normalize_translation,
     subsample,
 )
+from urrt_jax.geometry.neighbors import spacing
 from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.network import Model, estimate, point_regions
+from urrt_jax.origins import between_origins, check_rigid, near_origin
 from urrt_jax.refine import ICP, icp
 from urrt_jax.search import Search
 from urrt_jax.search import search as find_pose
 from urrt_jax.weights import load_model
 
-_LARGEST = 1e15
 STEPS_BEFORE_REFINEMENT = 2  # of the network, at most: refinement does the rest
 
 
@@ -113,6 +115,7 @@ def register(
     model: Model | None = None,
     refine: ICP | None = ICP(),
     search: Search | Literal["auto"] | None = None,
+    initial: ArrayLike | None = None,
     inlier_distance: ArrayLike | None = None,
 ) -> Registration:
     """The rigid transform that carries ``source`` onto ``target``: ``target ≈ R @ source + t``.
@@ -138,6 +141,9 @@ def register(
         them, or the search's. Static under jit.
       search: how to look for the pose among all poses (``Search()``); "auto" does so only where the plain result has
         not converged, and always under jit and vmap, where that can't be seen; None never does. Static under jit.
+      initial: (4, 4), a rough transform from source to target where one is known, as from odometry or a turntable: the
+        network and the search begin with the source moved by it, and largest angles count from it. No derivative
+        passes to it.
       inlier_distance: the distance that defines ``fitness`` and ``rmse``, in the input's units; by default 1.5 times
         the coarser cloud's spacing.
 
@@ -146,8 +152,9 @@ def register(
 
     Raises:
       ValueError: a cloud of the wrong shape or dtype, empty, with fewer than three distinct points or with values that
-        are not finite; a mask of the wrong length; an inlier distance that is not positive. Under jit values can't be
-        seen: non-finite points are then ignored, and a cloud left without three points is flagged by ``converged``.
+        are not finite; a mask of the wrong length; an inlier distance that is not positive; an initial transform that
+        is not rigid. Under jit values can't be seen: non-finite points are then ignored, and a cloud left without three
+        points, or an initial transform that is not finite, is flagged by ``converged``.
     """
     check_cloud(source, source_mask, "source")
     check_cloud(target, target_mask, "target")
@@ -162,30 +169,22 @@ def register(
     known = inlier_distance is not None and not isinstance(inlier_distance, Tracer)
     if known and not np.all(np.asarray(inlier_distance) > 0):
         raise ValueError(f"inlier_distance: expected a positive length, got {inlier_distance}")
+    if initial is not None:
+        check_rigid(initial)
     model = load_model() if model is None else model
     if refine is not None:
         model = model.at_most(STEPS_BEFORE_REFINEMENT)
-    source, source_origin = _near_origin(source, source_mask, "source")
-    target, target_origin = _near_origin(target, target_mask, "target")
-    first = None if search == "auto" else search
-    result = _register(source, target, source_mask, target_mask, model, refine, first, inlier_distance)
+    source, source_origin = near_origin(source, source_mask, "source")
+    target, target_origin = near_origin(target, target_mask, "target")
+    begin = None if initial is None else between_origins(initial, source_origin, target_origin)
+
+    def attempt(search: Search | None) -> Registration:
+        return _register(source, target, source_mask, target_mask, model, begin, refine, search, inlier_distance)
+
+    result = attempt(None if search == "auto" else search)
     if search == "auto" and (isinstance(result.converged, Tracer) or not bool(result.converged)):
-        result = _register(source, target, source_mask, target_mask, model, refine, Search(), inlier_distance)
+        result = attempt(Search())
     return _restore_origins(result, source_origin, target_origin)
-
-
-def _near_origin(points: ArrayLike, mask: ArrayLike | None, name: str) -> tuple[Array, np.ndarray | None]:
-    """The points as float32 and the origin (3,) that was subtracted; only host arrays of more digits need one."""
-    if isinstance(points, jax.Array) or getattr(points, "dtype", None) == np.float32:
-        near = jnp.asarray(points)
-        return near.astype(jnp.promote_types(near.dtype, jnp.float32)), None  # one program for all short dtypes
-    values = np.asarray(points, np.float64)
-    real = values if mask is None or isinstance(mask, Tracer) else values[np.asarray(mask, bool)]
-    origin = real[np.all(np.isfinite(real), axis=-1)].mean(axis=0)
-    centred = values - origin
-    if not np.all(np.abs(centred[np.isfinite(centred)]) < _LARGEST):
-        raise ValueError(f"{name}: coordinates beyond ±{_LARGEST:g} about their mean are too large for float32")
-    return jnp.asarray(centred.astype(np.float32)), origin
 
 
 def _restore_origins(result: Registration, source: np.ndarray | None, target: np.ndarray | None) -> Registration:
@@ -215,32 +214,43 @@ def _register(
     source_mask: Array | None,
     target_mask: Array | None,
     model: Model,
+    initial: Rigid | None,
     refine: ICP | None,
     search: Search | None,
     inlier_distance: Array | None,
 ) -> Registration:
+    begin, known = _usable(initial)
+    if initial is not None:
+        source_points = rigid.apply(begin, source_points)
     raw_source, raw_target = make_cloud(source_points, source_mask), make_cloud(target_points, target_mask)
     source, target, frame = normalize_pair(raw_source, raw_target)
     prepared = prepare(source), prepare(target)
-    small = _even_samples(*prepared, model, refine)
+    small = _even_samples(*prepared, model, refine, search)
     answer = estimate(model, *(jax.tree.map(lambda leaf: leaf[: model.config.points], cloud) for cloud in small))
     start, trusted = answer.transform, None
+    if initial is not None:
+        start = _better(start, Rigid(jnp.eye(3), normalize_translation(jnp.eye(3), jnp.zeros(3), frame)), small)
     if search is not None:
-        start, _, trusted = find_pose(model, *prepared, search, start)
+        start, _, trusted = find_pose(model, *prepared, search, start, small=small)
     if refine is None:
         transform, settled, steps = start, jnp.array(True), jnp.array(0)
     else:
         transform, settled, steps = icp(*prepared, start, refine, reach=trusted, small=small)
 
-    found = fit(*prepared, transform)
-    reach = found.touching if inlier_distance is None else jnp.asarray(inlier_distance) / frame.scale
+    asked = jnp.asarray(0.0 if inlier_distance is None else inlier_distance) / frame.scale
+    found = fit(*prepared, transform, asked)
+    reach = found.touching if inlier_distance is None else asked
     fitness, rmse = inlier_share(source.mask, found.squared, reach)
     inlier = source.mask & (found.squared <= reach**2)
-    usable = well_posed(source) & well_posed(target) & jnp.all(jnp.isfinite(transform.translation))
+    usable = known & well_posed(source) & well_posed(target) & jnp.all(jnp.isfinite(transform.translation))
     seen = rigid.apply(answer.seen, source.points)
+    final, coarse = (
+        rigid.compose(Rigid(each.rotation, denormalize_translation(*each, frame)), begin)
+        for each in (transform, answer.transform)
+    )
     return Registration(
-        rotation=transform.rotation,
-        translation=denormalize_translation(transform.rotation, transform.translation, frame),
+        rotation=final.rotation,
+        translation=final.translation,
         fitness=fitness,
         rmse=rmse * frame.scale,
         inlier_distance=reach * frame.scale,
@@ -251,15 +261,37 @@ def _register(
         information=information(raw_target.points[found.nearest], inlier),
         source_regions=jnp.where(source.mask, point_regions(model, seen, answer.source), 0),
         target_regions=jnp.where(target.mask, point_regions(model, target.points, answer.target), 0),
-        coarse=Rigid(
-            answer.transform.rotation,
-            denormalize_translation(answer.transform.rotation, answer.transform.translation, frame),
-        ),
+        coarse=coarse,
         steps=steps,
     )
 
 
-def _even_samples(source: Prepared, target: Prepared, model: Model, refine: ICP | None) -> tuple[Cloud, Cloud]:
-    """Both clouds' farthest-point samples, large enough for the network and for refinement's first stage."""
-    count = max(model.config.points, 0 if refine is None else 2 * refine.coarse_points)
+def _usable(initial: Rigid | None) -> tuple[Rigid, Array]:
+    """The transform, without derivatives, and whether it is finite; the identity where it is not, or there is none."""
+    nothing = rigid.identity()
+    if initial is None:
+        return nothing, jnp.array(True)
+    finite = jnp.all(jnp.isfinite(initial.rotation)) & jnp.all(jnp.isfinite(initial.translation))
+    rotation, translation = jax.tree.map(
+        lambda leaf, other: jax.lax.stop_gradient(jnp.where(finite, leaf, other)), initial, nothing
+    )
+    return Rigid(rigid.nearest_rotation(rotation), translation), finite
+
+
+def _better(first: Rigid, second: Rigid, small: tuple[Cloud, Cloud]) -> Rigid:
+    """The one of two transforms after which the samples lie better on each other."""
+    reach = jnp.maximum(jnp.maximum(*map(spacing, small)), 1e-6)  # points may all coincide
+    worse = agreement(first, small, small, reach) < agreement(second, small, small, reach)
+    return jax.tree.map(lambda one, other: jnp.where(worse, other, one), first, second)
+
+
+def _even_samples(
+    source: Prepared, target: Prepared, model: Model, refine: ICP | None, search: Search | None
+) -> tuple[Cloud, Cloud]:
+    """Both clouds' farthest-point samples: large enough for the network, for refinement's and search's first stages."""
+    count = max(
+        model.config.points,
+        0 if refine is None else 2 * refine.coarse_points,
+        0 if search is None else search.quick,
+    )
     return subsample(source.cloud, count, order=source.order), subsample(target.cloud, count, order=target.order)

@@ -2,7 +2,7 @@
 
     python experiments/benchmarks/stages.py --data PATH
 
-Batches of 64 clean pairs of 1,024 points from the test split. Every stage is compiled and timed alone, on what the
+Batches of 32 clean pairs of 1,024 points from the test split. Every stage is compiled and timed alone, on what the
 stages before it give, so that their sum and the whole differ a little. The hot loop, the placing of landmarks, compares
 every query with every key: its rate is set against that of one large product of matrices, and what it would move, were
 no logit kept in a cache, against that of a copy, both measured in the same run. Writes stages.json and stages.md beside
@@ -38,7 +38,7 @@ from urrt_jax.refine import icp
 from urrt_jax.registration import STEPS_BEFORE_REFINEMENT
 
 HERE = Path(__file__).parent
-BATCH = 64
+BATCH = 32
 
 
 def milliseconds(function: Callable, *inputs: object, repeats: int = 7, batch: int = BATCH) -> float:

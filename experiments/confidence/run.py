@@ -108,6 +108,7 @@ def turned(trials: Sequence[Trial], seed: int) -> list[Trial]:
             target=(trial.target @ turn.T).astype(np.float32),
             rotation=turn @ trial.rotation,
             translation=turn @ trial.translation,
+            expected=None,
         )
         for trial, turn in zip(trials, turns, strict=True)
     ]

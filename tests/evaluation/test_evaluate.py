@@ -1,5 +1,6 @@
 """Evaluation gives what single calls give, for every item once, whatever fails or stops on the way."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -242,3 +243,23 @@ def test_bad_arguments_are_named(clouds, arguments, message):
     given = {"method": "identity", "protocol": "dcp"} | arguments
     with pytest.raises(ValueError, match=message):
         evaluate(given.pop("method"), given.pop("protocol"), clouds, progress=False, **given)
+
+
+def test_an_informed_method_begins_at_the_rotation_that_the_protocol_expects(clouds, small_model):
+    plain = Ours(model=small_model, refine=None, batch=2)
+    informed = dataclasses.replace(plain, informed=True)
+    found = evaluate(informed, "dcp", clouds, items=np.array([0, 1]), progress=False)
+    for row in range(2):
+        trial = PROTOCOLS["dcp"](clouds, row)
+        initial = np.eye(4)
+        initial[:3, :3] = trial.expected
+        expected = register(trial.source, trial.target, model=small_model, refine=None, initial=initial)
+        np.testing.assert_allclose(found.rotations[row], expected.rotation, atol=1e-3)
+    uninformed = evaluate(plain, "dcp", clouds, items=np.array([0, 1]), progress=False)
+    assert np.abs(uninformed.rotations - found.rotations).max() > 1e-2
+
+
+def test_what_an_informed_method_knows_is_part_of_its_identity(small_model):
+    plain = Ours(model=small_model)
+    assert dataclasses.replace(plain, informed=True).identity() != plain.identity()
+    assert find_method("search_near").informed and not find_method("search").informed  # type: ignore[attr-defined]

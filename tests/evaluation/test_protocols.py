@@ -244,3 +244,12 @@ def test_mistyped_protocols_are_named(name, message):
 def test_a_protocol_refuses_data_that_would_make_it_milder(clouds, name, points, message):
     with pytest.raises(ValueError, match=message):
         find_protocol(name)(clouds[:, :points], 0)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_all_rotations_are_within_45_degrees_of_the_expected_one(clouds, name):
+    many = np.broadcast_to(clouds[:1], (300, *clouds.shape[1:]))
+    trials = [PROTOCOLS[name](many, item) for item in range(0, 300, 5)]
+    turns = np.stack([trial.expected.T @ trial.rotation for trial in trials])
+    angles = np.rad2deg(Rotation.from_matrix(turns).magnitude())
+    assert angles.max() < 45 and 15 < angles.mean() < 28

@@ -256,3 +256,13 @@ def test_memory_is_a_few_copies_of_both_clouds(two_hundred_thousand):
     """The distance of every query to every block would be 625 MB; to every point, 160 GB. This is 14 MB."""
     query, points, search = two_hundred_thousand
     assert search.memory_analysis().temp_size_in_bytes < 5 * (query.nbytes + points.nbytes)
+
+
+@pytest.mark.parametrize("order", ["along the curve", "at random"])
+def test_the_order_that_is_given_changes_time_alone(order):
+    query, points = _clouds("random")
+    rows = np.random.default_rng(1).permutation(len(query))
+    if order == "along the curve":
+        rows = np.asarray(curve_order(jnp.asarray(query), jnp.ones(len(query), bool)))
+    found = jax.jit(lambda query, points, rows: nearest(query, make_cloud(points), order=rows))(query, points, rows)
+    np.testing.assert_array_equal(found.index, _nearest(query, points, np.ones(len(points), bool)).index)

@@ -119,12 +119,19 @@ def test_what_has_no_counterpart_does_not_pull(surface):
 
 
 def test_what_has_no_counterpart_does_not_pull_in_dense_clouds():
-    """Of which some points ask and blocks answer, and whose spacing is a small share of their size."""
+    """Of which some points ask and blocks answer, and which are thinned first, so that hardly any point has one."""
     dense, random = _surface(9000), np.random.default_rng(0)
     source, target = (dense[random.random(9000) < 0.7] for _ in range(2))
     error, converged = refine(source, target @ TURN.T, rows=6600)
     assert error < 1e-4
     assert converged
+
+
+def test_large_clouds_take_all_iterations_and_no_more():
+    dense = _surface(10_000)
+    source, target = _padded(dense[::2], 6600), _padded(dense[1::2], 6600)
+    found = _icp(source, target, rigid.Rigid(jnp.asarray(TURN.T, jnp.float32), jnp.zeros(3)), ICP(iterations=4))
+    assert int(found.iterations) == 4 and not bool(found.converged)
 
 
 def test_the_reach_stays_where_nothing_coincides():

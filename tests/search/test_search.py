@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from urrt_jax import load_model, register
 from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair
+from urrt_jax.geometry.clouds import make_cloud, normalize_pair, subsample
 from urrt_jax.model.network import estimate, propose
 from urrt_jax.search import Found, Search, search
 
@@ -236,13 +236,78 @@ def test_a_stray_point_does_not_matter(find, partial):
     assert _degrees(find(source, target).transform.rotation, _turn(120)) < 3
 
 
+@pytest.mark.parametrize(("preference", "expected"), [(0.0, 70), (0.5, 20)])
+def test_of_poses_that_fit_nearly_alike_the_one_that_turns_less_is_preferred(small_model, preference, expected):
+    """A cloud of four-fold symmetry but for a few points, turned by 70 degrees: a turn by -20 degrees nearly fits."""
+    random = np.random.default_rng(0)
+    quarter = random.uniform([0.3, 0.1, -1], [1.0, 0.3, 1], (50, 3))
+    turns = Rotation.from_rotvec(np.outer(np.arange(4) * np.pi / 2, [0, 0, 1])).as_matrix()
+    few = random.uniform([0.3, 0.5, -1], [0.5, 0.7, 1], (6, 3))
+    source = np.concatenate([*(quarter @ turn.T for turn in turns), few]).astype(np.float32)
+    turn, other = (Rotation.from_rotvec([0, 0, np.deg2rad(angle)]).as_matrix() for angle in (70, -20))
+    plain = rigid.Rigid(jnp.asarray(other, jnp.float32), jnp.zeros(3))
+    config = dataclasses.replace(_SMALL, points=_SIZE, preference=preference)  # all points, which fit alike
+    found = _jitted(small_model, config, _pad(source), _pad((source @ turn.T).astype(np.float32)), plain)
+    assert _degrees(found.transform.rotation, np.eye(3)) == pytest.approx(expected, abs=4)
+    assert float(found.score) > 0.9  # what a turn costs is not taken from it
+
+
+@pytest.fixture(scope="module")
+def scans(make_cloud_points):
+    """Two dense clouds of other points, partial, the second turned by 120 degrees."""
+    source, target = (make_cloud_points(seed, 25) for seed in (1, 2))
+    source, target = source[source[:, 0] > -0.5], target[target[:, 1] > -0.4]
+    return source[:4100], (target @ _turn(120).T + _SHIFT).astype(np.float32)[:4100]
+
+
+@pytest.fixture(scope="module")
+def look(small_model, scans):
+    """A function of options of the search: what it finds of the dense clouds."""
+    return lambda **options: _jitted(
+        small_model, dataclasses.replace(_SMALL, **options), *((cloud, np.ones(len(cloud), bool)) for cloud in scans)
+    )
+
+
+def test_a_quick_look_finds_the_pose_of_dense_clouds(look):
+    assert _degrees(look(quick=256, sure=1e-6).transform.rotation, _turn(120)) < 5
+
+
+def test_a_quick_look_that_is_not_sure_gives_way_to_the_whole_search(look):
+    unsure, whole = look(quick=256, sure=1.5), look(quick=0)
+    _same(unsure, whole, atol=1e-6)
+    assert float(look(quick=256, sure=1e-6).reach) != pytest.approx(float(whole.reach), rel=1e-3)
+
+
+def test_a_quick_look_takes_the_samples_that_are_there(small_model, scans):
+    config = dataclasses.replace(_SMALL, quick=256, sure=1e-6)
+
+    @jax.jit
+    def both_ways(source, target):
+        pair = normalize_pair(make_cloud(source), make_cloud(target))[:2]
+        small = tuple(subsample(cloud, 256) for cloud in pair)
+        plain = rigid.identity()
+        return search(small_model, *pair, config, plain), search(small_model, *pair, config, plain, small=small)
+
+    _same(*both_ways(*scans))
+
+
+def test_sparse_clouds_are_not_looked_at_quickly(find, partial):
+    _same(find(*partial(120), dataclasses.replace(_SMALL, quick=64, sure=1e-6)), find(*partial(120)), atol=1e-6)
+
+
+@pytest.mark.parametrize("preference", [-0.1, 1.5, float("nan"), "much"])
+def test_a_preference_that_is_no_share_is_refused(preference):
+    with pytest.raises(ValueError, match=f"^preference: expected a share from 0 to 1, got {preference!r}"):
+        Search(preference=preference)
+
+
 @pytest.mark.parametrize("name", ["points", "support", "tried", "kept"])
 def test_too_few_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"^{name}: expected at least .*, got 0$"):
         Search(**{name: 0})
 
 
-@pytest.mark.parametrize("name", ["matches", "landmarks"])
+@pytest.mark.parametrize("name", ["matches", "landmarks", "quick"])
 def test_negative_numbers_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"^{name}: expected at least 0, got -1"):
         Search(**{name: -1})
@@ -259,7 +324,9 @@ def test_a_search_without_hypotheses_is_refused():
         Search(matches=0, landmarks=0)
 
 
-@pytest.mark.parametrize("name", ["normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance"])
+@pytest.mark.parametrize(
+    "name", ["normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance", "sure"]
+)
 @pytest.mark.parametrize("length", [0.0, -1.0, float("nan")])
 def test_lengths_that_are_not_positive_are_refused_by_name(name, length):
     with pytest.raises(ValueError, match=f"^{name}: expected a positive number, got {length}"):

@@ -25,6 +25,8 @@ class Register:
         picture: Write a picture of before and after here (.png, .pdf or .svg).
         search: Look among all poses, whatever the rotation and with partial overlap: 'auto' where the plain result has
             not converged.
+        initial: File of a rough transform from source to target, where one is known: four rows of text, .npy, or what
+            --json printed.
         no_refine: Keep the network's own estimate, without search and ICP.
         model: Name of a packaged model, or a file written by 'urrt train'.
         inlier_distance: What counts as touching in fitness and rmse, in the clouds' unit; by default 1.5 times the
@@ -38,6 +40,7 @@ class Register:
     out: Path | None = None
     picture: Path | None = None
     search: Literal["auto", "always", "never"] = "auto"
+    initial: Path | None = None
     no_refine: bool = False
     model: str = "modelnet40"
     inlier_distance: float | None = None
@@ -47,7 +50,7 @@ class Register:
         """Registers, prints, and writes what was asked for."""
         from urrt_jax import Search, load_model, register
         from urrt_jax.cli.printing import as_dict, as_table
-        from urrt_jax.io import read_cloud, write_cloud
+        from urrt_jax.io import read_cloud, read_transform, write_cloud
         from urrt_jax.refine import ICP
         from urrt_jax.viewer import plot_registration, region_colors
 
@@ -61,6 +64,7 @@ class Register:
             model=load_model(self.model),
             refine=None if self.no_refine else ICP(),
             search=None if self.no_refine else {"auto": "auto", "always": Search(), "never": None}[self.search],
+            initial=None if self.initial is None else read_transform(self.initial),
             inlier_distance=self.inlier_distance,
         )
         if self.out is not None:

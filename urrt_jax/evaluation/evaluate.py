@@ -273,7 +273,8 @@ def _align(method: Method, trials: Sequence[Trial], items: Sequence[int]) -> tup
 def _try(method: Method, trials: Sequence[Trial]) -> tuple[Poses, dict[int, str]]:
     """The poses, NaN where the method raised, and why, by row; a batch that raises is tried again one by one."""
     try:
-        return method.align([trial.source for trial in trials], [trial.target for trial in trials]), {}
+        informed = {"expected": [trial.expected for trial in trials]} if getattr(method, "informed", False) else {}
+        return method.align([trial.source for trial in trials], [trial.target for trial in trials], **informed), {}
     except Exception as error:  # a method may raise anything; it is counted, not hidden
         if len(trials) == 1:
             nothing = np.full(1, np.nan)

@@ -22,11 +22,13 @@ from urrt_jax.weights import load_model
 
 _LARGE = 4096  # clouds beyond this are padded to whole blocks, so that few programs are compiled for scans
 _BLOCK = 16_384
+_BATCH = 32  # pairs: on a CPU, twice as many leave its caches and take an eighth longer each
 # How each of ours refines, searches, and how many pairs it takes at once.
 _OURS: dict[str, tuple[ICP | None, Search | None, int]] = {
-    "network": (None, None, 64),
-    "register": (ICP(), None, 64),
+    "network": (None, None, _BATCH),
+    "register": (ICP(), None, _BATCH),
     "search": (ICP(), Search(max_angle=90.0), 8),
+    "search_near": (ICP(), Search(max_angle=45.0, preference=0.2, kept=16), 8),
     "search_all": (ICP(), Search(), 1),
 }
 
@@ -70,6 +72,7 @@ class Ours:
       model: the network.
       refine: as for ``register``.
       search: as for ``register``.
+      informed: whether it begins at the rotation that the protocol expects (``Trial.expected``).
       name: of the model, for titles.
       batch: pairs at once.
     """
@@ -77,13 +80,16 @@ class Ours:
     model: Model
     refine: ICP | None = ICP()
     search: Search | None = None
+    informed: bool = False
     name: str = "model"
-    batch: int = 64
+    batch: int = _BATCH
 
     @property
     def title(self) -> str:
         stages = "network alone" if self.refine is None else "refined"
-        return f"ours, {'searched and ' if self.search else ''}{stages} ({self.name})"
+        searched = "" if self.search is None else "searched and "
+        about = "searched about the middle of the protocol's poses and " if self.informed else searched
+        return f"ours, {about}{stages} ({self.name})"
 
     def identity(self) -> dict[str, Any]:
         return {
@@ -92,10 +98,21 @@ class Ours:
             "config": dataclasses.asdict(self.model.config),
             "refine": None if self.refine is None else dataclasses.asdict(self.refine),
             "search": None if self.search is None else dataclasses.asdict(self.search),
-        }
+        } | ({"informed": True} if self.informed else {})
 
-    def align(self, sources: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Poses:
-        found = _register_all(self.model, *_stack(sources), *_stack(targets), self.refine, self.search)
+    def align(
+        self,
+        sources: Sequence[np.ndarray],
+        targets: Sequence[np.ndarray],
+        expected: Sequence[np.ndarray | None] | None = None,
+    ) -> Poses:
+        """``Method.align``; where it is informed, ``expected`` are the rotations (3, 3) to begin at."""
+        initial = None
+        if self.informed and expected is not None and all(each is not None for each in expected):
+            initial = np.tile(np.eye(4, dtype=np.float32), (len(sources), 1, 1))
+            initial[:, :3, :3] = np.stack(expected)  # type: ignore[arg-type]
+        clouds = *_stack(sources), *_stack(targets)
+        found = _register_all(self.model, *clouds, initial, self.refine, self.search)
         return Poses(*(np.asarray(value) for value in jax.device_get(found)))
 
 
@@ -138,8 +155,9 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
 
     Args:
       method: ``"network"``, ``"register"`` and ``"search"`` are ours: alone, refined, and refined after a global search
-        over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans); a
-        model of its own may follow, as in ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
+        over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans;
+        ``"search_near"``: about the middle of the protocol's own, which learned methods know from training); a model of
+        its own may follow, as in ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
       model: what ours uses where the name says nothing of it: a packaged name or a file.
 
     Raises:
@@ -153,7 +171,9 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
         stages, colon, own = method.partition(":")
         if stages in _OURS and bool(colon) == bool(own):
             (refine, search, batch), used = _OURS[stages], own or model
-            return Ours(model=load_model(used), refine=refine, search=search, name=_short_name(used), batch=batch)
+            informed = stages == "search_near"
+            options = {"refine": refine, "search": search, "informed": informed, "batch": batch}
+            return Ours(model=load_model(used), name=_short_name(used), **options)
         if method not in PEERS:
             ours, others = ", ".join(_OURS), ", ".join(PEERS)
             raise ValueError(f"method: expected one of {ours} (or one with :MODEL), {others}, got {method!r}")
@@ -173,15 +193,16 @@ def _register_all(
     source_masks: Array,
     targets: Array,
     target_masks: Array,
+    initial: Array | None,
     refine: ICP | None,
     search: Search | None,
 ) -> tuple[Array, ...]:
-    def one(source: Array, source_mask: Array, target: Array, target_mask: Array) -> tuple[Array, ...]:
-        masks = {"source_mask": source_mask, "target_mask": target_mask}
-        result = register(source, target, **masks, model=model, refine=refine, search=search)
+    def one(source: Array, source_mask: Array, target: Array, target_mask: Array, initial: Array | None) -> tuple:
+        options = {"model": model, "refine": refine, "search": search, "initial": initial}
+        result = register(source, target, source_mask=source_mask, target_mask=target_mask, **options)
         return result.rotation, result.translation, result.fitness, result.converged.astype(jnp.float32)
 
-    return jax.vmap(one)(sources, source_masks, targets, target_masks)
+    return jax.vmap(one)(sources, source_masks, targets, target_masks, initial)
 
 
 def _stack(clouds: Sequence[np.ndarray]) -> tuple[Array, Array]:

@@ -29,6 +29,8 @@ class Trial(NamedTuple):
       translation: (3,) float64.
       clean: (P, 3) float32, the whole shape without noise in the target's frame; None where it is not known.
       scale: the length that errors of translation are compared with: 1 for shapes in the unit sphere.
+      expected: (3, 3), the rotation in the middle of those that the protocol draws, which methods trained on its poses
+        have learned; None for scans, which come in any.
     """
 
     source: np.ndarray
@@ -37,6 +39,7 @@ class Trial(NamedTuple):
     translation: np.ndarray
     clean: np.ndarray | None = None
     scale: float = 1.0
+    expected: np.ndarray | None = None
 
 
 Protocol = Callable[..., Trial]
@@ -47,6 +50,10 @@ def draw_pose(random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
     x, y, z = (random.uniform() * np.pi / 4 for _ in range(3))
     translation = np.array([random.uniform(-0.5, 0.5) for _ in range(3)])
     return Rotation.from_euler("zyx", [z, y, x]).as_matrix(), translation
+
+
+MIDDLE = Rotation.from_euler("zyx", [np.pi / 8] * 3).as_matrix()
+"""The rotation in the middle of DCP's: all of them are within 45° of it."""
 
 
 def draw_noise(random: np.random.RandomState, count: int, sigma: float = SIGMA) -> np.ndarray:
@@ -120,8 +127,8 @@ def rpmnet(clouds: np.ndarray, item: int, *, keep: float = 0.7, points: int = 10
     target = random.permutation(target)
     source = random.permutation(source)
     # Here the source is the moved cloud: the pair's truth is the way back.
-    back = rotation.T
-    return Trial(source.astype(np.float32), target.astype(np.float32), back, -back @ translation, whole)
+    source, target, back = source.astype(np.float32), target.astype(np.float32), rotation.T
+    return Trial(source, target, back, -back @ translation, whole, expected=MIDDLE.T)
 
 
 def incomplete(clouds: np.ndarray, item: int, *, both: bool = False, kept: int = KEPT) -> Trial:
@@ -253,7 +260,7 @@ class _Pair(NamedTuple):
         clean = self.whole @ self.rotation.T + self.translation
         return Trial(
             source.astype(np.float32), target.astype(np.float32), self.rotation, self.translation,
-            clean.astype(np.float32),
+            clean.astype(np.float32), expected=MIDDLE,
         )  # fmt: skip
 
 

@@ -50,7 +50,9 @@ def make_blocks(cloud: Cloud, order: Array | None = None) -> Blocks:
     return Blocks(cloud, jnp.swapaxes(points, 1, 2), rows, jnp.min(points, axis=1), high)
 
 
-def nearest_in_blocks(query: Array, blocks: Blocks, within: Array | float, distinct: bool) -> tuple[Array, Array]:
+def nearest_in_blocks(
+    query: Array, blocks: Blocks, within: Array | float, distinct: bool, order: Array | None = None
+) -> tuple[Array, Array]:
     """The row (N,) of the nearest real point of every query (N, 3) that is closer than ``within``, and whether one is.
 
     Args:
@@ -58,12 +60,13 @@ def nearest_in_blocks(query: Array, blocks: Blocks, within: Array | float, disti
       blocks: of M points.
       within: what lies farther is not looked for, which saves most of the work where little lies nearer.
       distinct: pass over points that coincide with the query.
+      order: the queries' rows (N,) such that those near in it are near in space; ``curve_order`` by default, a sort.
     """
     count = query.shape[0]
     if not count:
         return jnp.zeros(0, jnp.int32), jnp.zeros(0, bool)
     tile = min(_TILE, count)
-    order = curve_order(query, jnp.ones(count, bool))
+    order = curve_order(query, jnp.ones(count, bool)) if order is None else order
     tiles = jnp.pad(query[order], ((0, -count % tile), (0, 0)), mode="edge").reshape(-1, tile, 3)
     limit = jnp.full(tile, jnp.square(jnp.asarray(within, query.dtype)))
 

@@ -43,6 +43,7 @@ def nearest(
     within: Array | float = jnp.inf,
     distinct: bool = False,
     block: int | None = 16,
+    order: Array | None = None,
 ) -> Neighbors:
     """The nearest real reference point of every query: index (N,) and squared distance (N,).
 
@@ -55,6 +56,8 @@ def nearest(
       within: neighbours must be closer than this, (); large clouds are searched faster for it.
       distinct: pass over reference points that coincide with the query.
       block: small clouds: reference points per step of the loop; None compares all at once, through an (N, M) matrix.
+      order: large clouds: the query's rows (N,) such that those near in it are near in space, as ``curve_order`` of the
+        cloud that they are from, however it was moved since; saves a sort.
     """
     reference = reference if isinstance(reference, Blocks) else searchable(reference)
     cloud = reference.cloud if isinstance(reference, Blocks) else reference
@@ -77,7 +80,7 @@ def nearest(
     if isinstance(reference, Blocks):
         # Walking over blocks is a loop of small steps: right for a CPU, while accelerators compare all sooner.
         index, found = jax.lax.platform_dependent(
-            cpu=lambda: nearest_in_blocks(fixed, reference, within, distinct), default=compare_all
+            cpu=lambda: nearest_in_blocks(fixed, reference, within, distinct, order), default=compare_all
         )
     else:
         index, found = compare_all()

@@ -1,13 +1,16 @@
 """Iterative closest points, robust and coarse to fine, whose end differentiates.
 
 Stage one looks for the basin on small even subsamples, point to point (Besl and McKay 1992). Stage two makes it exact:
-pairs from both directions, distances along normals as well as between points. Both weigh pairs by Geman and McClure's
-function, whose width shrinks step by step (as in Zhou et al. 2016): in stage two to the spacing, and from there to what
-the pairs that count say of their own distances. Where points have their counterparts, that is next to nothing, and
-those without do not pull. Where sparse clouds have none, a third stage pairs all points (``soft.py``).
+pairs from both directions, distances along normals as well as between points; large clouds go through it thinned first.
+Both weigh pairs by Geman and McClure's function, whose width shrinks step by step (as in Zhou et al. 2016): in stage
+two to the spacing, and from there to what the pairs that count say of their own distances. Where points have their
+counterparts, that is next to nothing, and those without do not pull. Where sparse clouds have none, a third stage pairs
+all points (``soft.py``).
 """
 
+import functools
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -30,7 +33,8 @@ _SHRINK, _SHRINK_FINE = 0.8, 0.7
 _SPREADS = 2.0  # the last reach, in root mean square distances of the pairs that count
 _NARROWEST = 0.05  # the last reach at least, in inlier distances
 _STEADY, _STEADY_SHARE = 20.0, 1000.0  # by how much it may still change: tolerances, and as many inlier distances each
-_NORMAL_POINTS = 4096  # of a large cloud, that normals are made from
+_THINNED = 4096  # points of a large cloud, that normals are made from and pairs are looked for at first
+_ONE_IN, _ROUGHLY = 4, 10.0  # of those that ask, so many do then, until steps are this many tolerances small
 _APART = 0.3  # the last reach, in inlier distances, above which points have no counterparts
 _WHOLE, _TOUCHING = (
     0.8,
@@ -144,25 +148,37 @@ def _settle(source: Prepared, target: Prepared, initial: Rigid, reach: Array, co
     def weigh(squared: Array, reach: Array) -> Array:
         return robust_weights(jnp.where(trimmed(squared), squared, jnp.inf) if config.trim else squared, reach)
 
-    def unfinished(now: _Progress) -> Array:
-        return ~now.settled & (now.iteration < config.iterations)
-
-    def step(fixed: tuple[Surface, Surface, Array], now: _Progress) -> _Progress:
+    def step(fixed: tuple[Surface, Surface, Array], now: _Progress, tolerance: float) -> _Progress:
         source, target, floor = fixed
         pairs = find_pairs(source, target, now.transform, _SEEN * now.reach, mutual=config.mutual)
         weights = weigh(pairs.squared, now.reach)
         # With fewer than three pairs the transform stays and never settles.
         paired = jnp.sum(weights > 0) >= 3
         motion = jnp.where(paired, bounded_step(*normal_equations(pairs, weights, config.plane)), 0.0)
-        still = (jnp.linalg.norm(motion[:3]) < config.tolerance) & (jnp.linalg.norm(motion[3:]) < config.tolerance)
+        still = (jnp.linalg.norm(motion[:3]) < tolerance) & (jnp.linalg.norm(motion[3:]) < tolerance)
         narrow = jnp.sqrt(_squared_reach(pairs.squared, weights, floor))
         reach = jnp.where(now.reach <= floor, narrow, jnp.maximum(now.reach * _SHRINK_FINE, floor))
         change = jnp.abs(reach - now.reach)
-        steady = (now.reach <= floor) & (change < config.tolerance * jnp.minimum(_STEADY, _STEADY_SHARE * floor))
+        steady = (now.reach <= floor) & (change < tolerance * jnp.minimum(_STEADY, _STEADY_SHARE * floor))
         return _Progress(move(motion, now.transform), reach, paired & still & steady, now.iteration + 1)
 
-    start = _Progress(initial, jnp.maximum(reach, jax.lax.stop_gradient(floor)), jnp.array(False), jnp.array(0))
-    end = while_each(unfinished, step, start, (*loose, jax.lax.stop_gradient(floor)))
+    def advance(
+        begin: _Progress, surfaces: Iterable[Surface], floor: Array, *, iterations: int, tolerance: float
+    ) -> _Progress:
+        def unfinished(now: _Progress) -> Array:
+            return ~now.settled & (now.iteration < iterations)
+
+        begin = begin._replace(reach=jnp.maximum(begin.reach, floor), settled=jnp.array(False))
+        return while_each(unfinished, functools.partial(step, tolerance=tolerance), begin, (*surfaces, floor))
+
+    least = jax.lax.stop_gradient(floor)
+    now = _Progress(initial, reach, jnp.array(False), jnp.array(0))
+    if min(source.cloud.points.shape[0], target.cloud.points.shape[0]) > _THINNED:
+        rough = _thinned(source, loose[0]), _thinned(target, loose[1])
+        wide = jax.lax.stop_gradient(config.inlier_distance * jnp.maximum(*map(_thinned_spacing, (source, target))))
+        limits = {"iterations": config.iterations // 2, "tolerance": _ROUGHLY * config.tolerance}
+        now = advance(now, rough, wide, **limits)._replace(reach=least)
+    end = advance(now, loose, least, iterations=config.iterations, tolerance=config.tolerance)
 
     pairs = find_pairs(*loose, end.transform, _SEEN * end.reach, mutual=config.mutual)
     counted = weigh(pairs.squared, end.reach) > 0
@@ -208,10 +224,20 @@ def _squared_reach(squared: Array, weights: Array, widest: Array) -> Array:
 
 def _surface(cloud: Prepared, config: ICP) -> Surface:
     """The points that ask, their normals, and the cloud prepared to answer."""
-    asking, dense = cloud.thin(config.points), cloud.thin(_NORMAL_POINTS)
+    asking = cloud.thin(config.points)
     if not config.plane:
         return Surface(asking, jnp.zeros_like(asking.points), cloud.reference)
-    # Spacings grow as the square root of the points left out, on a surface.
-    thinner = math.sqrt(max(1.0, cloud.cloud.points.shape[0] / _NORMAL_POINTS))
-    radius = config.normal_radius * thinner * cloud.spacing
-    return Surface(asking, normals(asking.points, dense, radius, centroid(cloud.cloud)), cloud.reference)
+    radius = config.normal_radius * _thinned_spacing(cloud)
+    return Surface(asking, normals(asking.points, cloud.thin(_THINNED), radius, centroid(cloud.cloud)), cloud.reference)
+
+
+def _thinned(cloud: Prepared, surface: Surface) -> Surface:
+    """The surface of a large cloud, thinned: fewer points ask, and fewer answer."""
+    asking = jax.tree.map(lambda leaf: leaf[::_ONE_IN], surface.asking)
+    answering = jax.tree.map(jax.lax.stop_gradient, cloud.thin(_THINNED))
+    return Surface(asking, surface.normals[::_ONE_IN], answering)
+
+
+def _thinned_spacing(cloud: Prepared) -> Array:
+    """The spacing, (), of a thinned cloud: on a surface, it grows as the square root of the points left out."""
+    return math.sqrt(max(1.0, cloud.cloud.points.shape[0] / _THINNED)) * cloud.spacing
