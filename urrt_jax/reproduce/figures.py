@@ -10,7 +10,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _INK, _FAINT = "#2f3640", "#8a94a0"
-_OURS = {"search": "#7b241c", "search_all": "#7b241c", "register": "#c0392b", "network": "#e59866"}
+_OURS = {
+    "search": "#7b241c",
+    "search_all": "#7b241c",
+    "search_near": "#2c0b08",
+    "register": "#c0392b",
+    "network": "#e59866",
+}
 _COLORS = (
     "#2a67b0", "#26897f", "#7054a8", "#b8860b", "#62a140", "#5d6d7e", "#d65c94", "#12b0c4", "#96582f", "#94284e",
     "#1b2631", "#7fb3d5", "#a9cc6a", "#c39bd3", "#d4ac0d", "#45b39d",
