@@ -10,7 +10,7 @@ from jax.core import Tracer
 
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.neighbors import nearest, spacing
+from urrt_jax.geometry.neighbors import coarser_spacing, nearest
 from urrt_jax.geometry.normals import least_axis
 from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid, nearest_rotation
@@ -111,7 +111,7 @@ def _uniqueness(source: Prepared, target: Prepared, transform: Rigid) -> Array:
     turned = jnp.matmul(axes, jnp.matmul(_TURNS, axes.T, precision=_HIGHEST), precision=_HIGHEST)
     rotations = jnp.concatenate([jnp.eye(3)[None], turned])
     turns = Rigid(rotations, centre - rigid.rotate(rotations, centre))
-    reach = jnp.maximum(jnp.maximum(*map(spacing, clouds)), 1e-6)  # points may all coincide
+    reach = coarser_spacing(*clouds)
     agreements = jax.vmap(lambda turn: agreement(rigid.compose(turn, transform), clouds, asked, reach))(turns)
     return agreements[0] - jnp.max(agreements[1:])
 

@@ -20,3 +20,11 @@ def check_positive(options: Any, *names: str) -> None:
         value = getattr(options, name)
         if not (isinstance(value, int | float) and 0 < value < math.inf):
             raise ValueError(f"{name}: expected a positive number, got {value!r}")
+
+
+def check_share(options: Any, *names: str) -> None:
+    """Refuses, with a ``ValueError`` naming the field, values that are not numbers from 0 to 1."""
+    for name in names:
+        value = getattr(options, name)
+        if not (isinstance(value, int | float) and 0 <= value <= 1):
+            raise ValueError(f"{name}: expected a share from 0 to 1, got {value!r}")

@@ -23,7 +23,7 @@ from urrt_jax.geometry.clouds import (
     normalize_translation,
     subsample,
 )
-from urrt_jax.geometry.neighbors import spacing
+from urrt_jax.geometry.neighbors import coarser_spacing
 from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
 from urrt_jax.model.network import Model, estimate, point_regions
@@ -280,7 +280,7 @@ def _usable(initial: Rigid | None) -> tuple[Rigid, Array]:
 
 def _better(first: Rigid, second: Rigid, small: tuple[Cloud, Cloud]) -> Rigid:
     """The one of two transforms after which the samples lie better on each other."""
-    reach = jnp.maximum(jnp.maximum(*map(spacing, small)), 1e-6)  # points may all coincide
+    reach = coarser_spacing(*small)
     worse = agreement(first, small, small, reach) < agreement(second, small, small, reach)
     return jax.tree.map(lambda one, other: jnp.where(worse, other, one), first, second)
 

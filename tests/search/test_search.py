@@ -282,13 +282,16 @@ def test_a_quick_look_takes_the_samples_that_are_there(small_model, scans):
     config = dataclasses.replace(_SMALL, quick=256, sure=1e-6)
 
     @jax.jit
-    def both_ways(source, target):
+    def three_ways(source, target):
         pair = normalize_pair(make_cloud(source), make_cloud(target))[:2]
         small = tuple(subsample(cloud, 256) for cloud in pair)
         plain = rigid.identity()
-        return search(small_model, *pair, config, plain), search(small_model, *pair, config, plain, small=small)
+        larger = tuple(cloud._replace(points=2 * cloud.points) for cloud in small)
+        return [search(small_model, *pair, config, plain, small=each) for each in (None, small, larger)]
 
-    _same(*both_ways(*scans))
+    own, given, larger = three_ways(*scans)
+    _same(own, given)
+    assert float(larger.reach) == pytest.approx(2 * float(own.reach), rel=1e-5)  # otherwise they might be ignored.
 
 
 def test_sparse_clouds_are_not_looked_at_quickly(find, partial):

@@ -57,6 +57,7 @@ class Register:
         for path in (self.out, self.picture):
             if path is not None and not path.parent.is_dir():
                 raise ValueError(f"{path}: there is no folder {path.parent} to write to")
+        initial = None if self.initial is None else read_transform(self.initial)
         source, target = (read_cloud(path, samples=self.samples) for path in (self.source, self.target))
         result = register(
             source,
@@ -64,7 +65,7 @@ class Register:
             model=load_model(self.model),
             refine=None if self.no_refine else ICP(),
             search=None if self.no_refine else {"auto": "auto", "always": Search(), "never": None}[self.search],
-            initial=None if self.initial is None else read_transform(self.initial),
+            initial=initial,
             inlier_distance=self.inlier_distance,
         )
         if self.out is not None:

@@ -23,13 +23,13 @@ from urrt_jax.weights import load_model
 _LARGE = 4096  # clouds beyond this are padded to whole blocks, so that few programs are compiled for scans
 _BLOCK = 16_384
 _BATCH = 32  # pairs: on a CPU, twice as many leave its caches and take an eighth longer each
-# How each of ours refines, searches, and how many pairs it takes at once.
-_OURS: dict[str, tuple[ICP | None, Search | None, int]] = {
-    "network": (None, None, _BATCH),
-    "register": (ICP(), None, _BATCH),
-    "search": (ICP(), Search(max_angle=90.0), 8),
-    "search_near": (ICP(), Search(max_angle=45.0, preference=0.2, kept=16), 8),
-    "search_all": (ICP(), Search(), 1),
+# What each of ours is told (``Ours``).
+_OURS: dict[str, dict[str, Any]] = {
+    "network": {"refine": None},
+    "register": {},
+    "search": {"search": Search(max_angle=90.0), "batch": 8},
+    "search_near": {"search": Search(max_angle=45.0, preference=0.2, kept=16), "informed": True, "batch": 8},
+    "search_all": {"search": Search(), "batch": 1},
 }
 
 
@@ -43,7 +43,11 @@ class Poses(NamedTuple):
 
 
 class Method(Protocol):
-    """A registration method as ``evaluate`` runs it."""
+    """A registration method as ``evaluate`` runs it.
+
+    One with an attribute ``informed`` that is true is also told what is known of the poses: ``align`` then takes
+    ``expected``, of every trial.
+    """
 
     @property
     def title(self) -> str:
@@ -86,10 +90,10 @@ class Ours:
 
     @property
     def title(self) -> str:
-        stages = "network alone" if self.refine is None else "refined"
-        searched = "" if self.search is None else "searched and "
-        about = "searched about the middle of the protocol's poses and " if self.informed else searched
-        return f"ours, {about}{stages} ({self.name})"
+        stages = ["network alone" if self.refine is None else "refined"]
+        if self.search is not None:
+            stages.insert(0, "searched about the middle of the protocol's poses" if self.informed else "searched")
+        return f"ours, {' and '.join(stages)} ({self.name})"
 
     def identity(self) -> dict[str, Any]:
         return {
@@ -170,10 +174,8 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
     if isinstance(method, str):
         stages, colon, own = method.partition(":")
         if stages in _OURS and bool(colon) == bool(own):
-            (refine, search, batch), used = _OURS[stages], own or model
-            informed = stages == "search_near"
-            options = {"refine": refine, "search": search, "informed": informed, "batch": batch}
-            return Ours(model=load_model(used), name=_short_name(used), **options)
+            used = own or model
+            return Ours(model=load_model(used), name=_short_name(used), **_OURS[stages])
         if method not in PEERS:
             ours, others = ", ".join(_OURS), ", ".join(PEERS)
             raise ValueError(f"method: expected one of {ours} (or one with :MODEL), {others}, got {method!r}")

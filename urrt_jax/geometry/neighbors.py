@@ -15,6 +15,7 @@ from urrt_jax.geometry.blocks import Blocks, make_blocks, nearest_in_blocks
 from urrt_jax.geometry.clouds import Cloud
 
 _QUERY_CHUNK = 16_384
+LEAST_SPACING = 1e-6  # of clouds whose points all coincide
 LARGE = 4096
 """Clouds beyond it are searched through blocks: 40,000 points against as many take 25 ms instead of 200."""
 
@@ -154,6 +155,11 @@ def k_nearest(query: Array, reference: Cloud, k: int, *, batch_size: int | None 
         index = jax.lax.map(one, fixed, batch_size=min(batch_size, max(1, query.shape[0])))
     squared = jnp.sum((query[:, None] - reference.points[index]) ** 2, axis=-1)
     return Neighbors(index, jnp.where(reference.mask[index], squared, jnp.inf))
+
+
+def coarser_spacing(source: Cloud, target: Cloud) -> Array:
+    """The larger of both clouds' spacings, (), never 0: points may all coincide."""
+    return jnp.maximum(jnp.maximum(spacing(source), spacing(target)), LEAST_SPACING)
 
 
 def spacing(cloud: Cloud | Blocks, *, sample: Cloud | None = None) -> Array:

@@ -8,10 +8,9 @@ from jax import Array
 from urrt_jax.geometry.blocks import Blocks
 from urrt_jax.geometry.clouds import Cloud, thin
 from urrt_jax.geometry.curve import curve_order
-from urrt_jax.geometry.neighbors import searchable, spacing
+from urrt_jax.geometry.neighbors import LEAST_SPACING, searchable, spacing
 
 _ASKED = 1024  # points at which the spacing of a large cloud is asked
-_LEAST_SPACING = 1e-6  # of clouds whose points all coincide
 
 
 class Prepared(NamedTuple):
@@ -41,4 +40,4 @@ def prepare(cloud: Cloud | Prepared) -> Prepared:
     order = curve_order(cloud.points, cloud.mask) if cloud.points.shape[0] > _ASKED else None
     reference = searchable(cloud, order)
     width = spacing(reference, sample=thin(cloud, _ASKED, order=order))
-    return Prepared(cloud, order, reference, jnp.maximum(width, _LEAST_SPACING))
+    return Prepared(cloud, order, reference, jnp.maximum(width, LEAST_SPACING))

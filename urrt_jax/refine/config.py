@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from urrt_jax.checks import check_positive, check_whole
+from urrt_jax.checks import check_positive, check_share, check_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,5 +48,4 @@ class ICP:
     def __post_init__(self) -> None:
         check_whole(self, coarse_points=0, coarse_iterations=1, points=3, iterations=1, soft_points=0)
         check_positive(self, "reach", "inlier_distance", "normal_radius", "tolerance")
-        if not (isinstance(self.plane, int | float) and 0 <= self.plane <= 1):
-            raise ValueError(f"plane: expected a share from 0 to 1, got {self.plane!r}")
+        check_share(self, "plane")

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from urrt_jax.checks import check_positive, check_whole
+from urrt_jax.checks import check_positive, check_share, check_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,8 +54,7 @@ class Search:
             raise ValueError(f"rotations: expected 0, 1, 24 or 60, got {self.rotations!r}")
         if not self.matches + self.landmarks + self.rotations:
             raise ValueError("matches, landmarks and rotations: all are 0, which leaves no hypothesis")
-        if not (isinstance(self.preference, int | float) and 0 <= self.preference <= 1):
-            raise ValueError(f"preference: expected a share from 0 to 1, got {self.preference!r}")
+        check_share(self, "preference")
         check_positive(
             self, "normal_radius", "feature_radius", "match_distance", "max_angle", "inlier_distance", "sure"
         )

@@ -11,7 +11,7 @@ from urrt_jax.assessment import agreement, fit
 from urrt_jax.features import fpfh
 from urrt_jax.geometry import rigid
 from urrt_jax.geometry.clouds import Cloud, centroid, subsample
-from urrt_jax.geometry.neighbors import spacing
+from urrt_jax.geometry.neighbors import coarser_spacing
 from urrt_jax.geometry.normals import normals
 from urrt_jax.geometry.prepared import Prepared, prepare
 from urrt_jax.geometry.rigid import Rigid
@@ -80,7 +80,7 @@ def search(
     def thorough() -> Found:
         both = _subsample(clouds[0], config.points), _subsample(clouds[1], config.points)
         seen = _first(both[0], model.config.points), _first(both[1], model.config.points)
-        guesses = [jax.tree.map(lambda leaf: leaf[None], plain)]
+        guesses = []
         if config.matches:
             guesses.append(_from_features(clouds, both, config, config.matches))
         if config.landmarks:
@@ -95,20 +95,19 @@ def search(
     if small is None:
         small = _subsample(clouds[0], config.quick), _subsample(clouds[1], config.quick)
     few: tuple[Cloud, Cloud] = _first(small[0], config.quick), _first(small[1], config.quick)
-    guesses = [jax.tree.map(lambda leaf: leaf[None], plain), _from_features(clouds, few, config, _QUICK_MATCHES)]
-    found = _choose(guesses, few, plain, config, _QUICK_TRIED)
+    found = _choose([_from_features(clouds, few, config, _QUICK_MATCHES)], few, plain, config, _QUICK_TRIED)
     return jax.lax.cond(fit(*few, found.transform).confidence >= config.sure, lambda: found, thorough)
 
 
 def _choose(guesses: list[Rigid], small: tuple[Cloud, Cloud], plain: Rigid, config: Search, tried: int) -> Found:
-    """The best of all guesses, in three rounds; ``plain`` where all turn too far."""
-    width = _width(small)
+    """The best of ``plain`` and all guesses, in three rounds; ``plain`` where all turn too far."""
+    width = coarser_spacing(*small)
     reach = config.inlier_distance * width
     some = _first(small[0], _COARSE_POINTS), _first(small[1], _COARSE_POINTS)
-    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *guesses)
+    every = jax.tree.map(lambda own, *others: jnp.concatenate([own[None], *others]), plain, *guesses)
     promising, _ = _best(every, lambda pose: agreement(pose, small, some, _NEARLY * reach), tried, config)
 
-    coarse = config.inlier_distance * _width(some)
+    coarse = config.inlier_distance * coarser_spacing(*some)
     denser = _first(small[1], 2 * _COARSE_POINTS)
     brief = _each(lambda pose: anneal(some[0], denser, pose, 3 * coarse, coarse, iterations=_BRIEF_STEPS), promising)
     kept, _ = _best(brief, lambda pose: agreement(pose, small, some, _NEARLY * reach), config.kept, config)
@@ -117,11 +116,6 @@ def _choose(guesses: list[Rigid], small: tuple[Cloud, Cloud], plain: Rigid, conf
     poses, scores = _best(full, lambda pose: agreement(pose, small, small, reach), 1, config)
     found = jax.tree.map(lambda leaf, given: jnp.where(scores[0] >= 0, leaf[0], given), poses, plain)
     return Found(found, jnp.maximum(scores[0], 0.0), width)
-
-
-def _width(small: tuple[Cloud, Cloud]) -> Array:
-    """The coarser subsample's spacing, (); points may all coincide."""
-    return jnp.maximum(jnp.maximum(*map(spacing, small)), 1e-6)
 
 
 def _each(function: Callable[[Rigid], Any], poses: Rigid) -> Any:
@@ -149,7 +143,7 @@ def _first(cloud: Cloud, count: int) -> Cloud:
 def _from_features(
     clouds: tuple[Prepared, Prepared], small: tuple[Cloud, Cloud], config: Search, matches: int
 ) -> Rigid:
-    width, features = _width(small), []
+    width, features = coarser_spacing(*small), []
     for cloud, part in zip(clouds, small, strict=True):
         dense = cloud.thin(_NORMAL_POINTS)
         surface = normals(part.points, dense, config.normal_radius * width, centroid(cloud.cloud))
