@@ -92,7 +92,11 @@ def real_scans() -> list[str]:
     return lines
 
 
+def as_markdown() -> str:
+    """The three tables of summary.md."""
+    return "\n\n".join("\n".join(table) for table in (recalls(), against_the_paper(), real_scans()))
+
+
 if __name__ == "__main__":
-    tables = ["\n".join(table) for table in (recalls(), against_the_paper(), real_scans())]
-    (HERE / "summary.md").write_text("\n\n".join(tables) + "\n")
-    print("\n\n".join(tables))
+    (HERE / "summary.md").write_text(as_markdown() + "\n")
+    print(as_markdown())

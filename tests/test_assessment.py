@@ -6,28 +6,40 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from urrt_jax import rigid, stages
 from urrt_jax.assessment import (
     Fit,
+    agreement,
     cross_matrix,
     fit,
+    fit_samples,
     information,
     inlier_share,
     moved_information,
     well_posed,
 )
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud, centroid, make_cloud, shift
-from urrt_jax.geometry.prepared import prepare
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.clouds import Cloud, centroid, make_cloud, shift
+from urrt_jax.prepared import Prepared, Sizes
+from urrt_jax.refine import ICP
+from urrt_jax.rigid import Rigid
 
-_fit = jax.jit(fit)
-_ROWS = 900  # all clouds are padded to it, so that one program is compiled
+_ROWS = 1024  # all clouds are padded to it, so that one program is compiled
+_SIZES = Sizes(sample=512, queries=ICP().points, normal_radius=ICP().normal_radius)  # those of ``register``
+_fit_prepared = jax.jit(fit)
 
 
-def _padded(points: np.ndarray) -> Cloud:
-    values = np.full((_ROWS, 3), 9.0, np.float32)
+def _prepared(cloud: Cloud) -> Prepared:
+    return stages.prepare(_SIZES, cloud)
+
+
+def _fit(source: Cloud, target: Cloud, transform: Rigid, reach: float = 0.0) -> Fit:
+    return _fit_prepared(_prepared(source), _prepared(target), transform, reach)
+
+
+def _padded(points: np.ndarray, rows: int = _ROWS) -> Cloud:
+    values = np.full((rows, 3), 9.0, np.float32)
     values[: len(points)] = points
-    return make_cloud(values, np.arange(_ROWS) < len(points))
+    return make_cloud(values, np.arange(rows) < len(points))
 
 
 def _sheet(start: float, stop: float) -> Cloud:
@@ -57,8 +69,8 @@ def test_overlap_of_clouds_far_apart_is_nothing():
 
 def test_neighbours_are_looked_for_as_far_as_asked():
     away = Rigid(jnp.eye(3), jnp.array([0.0, 0.0, 0.45]))
-    near, far = (jax.jit(fit)(_sheet(0, 2), _sheet(0, 2), away, reach) for reach in (0.0, 0.46))
-    real = np.asarray(_sheet(0, 2).mask)
+    near, far = (_fit(_sheet(0, 2), _sheet(0, 2), away, reach) for reach in (0.0, 0.46))
+    real = np.asarray(_prepared(_sheet(0, 2)).cloud.mask)
     assert not np.isfinite(near.squared).any()
     np.testing.assert_allclose(np.sqrt(far.squared[real]), 0.45, rtol=1e-5)
     np.testing.assert_array_equal(near.shares, far.shares)
@@ -78,21 +90,57 @@ def test_swapping_the_clouds_swaps_the_shares(cloud):
 def test_squared_distances_are_those_of_the_nearest_and_infinite_for_padding(cloud):
     source, target, transform = _padded(cloud[::2]), _padded(cloud[50:]), _turn(5)
     found = _fit(source, target, transform, 10.0)
+    source, target = (_prepared(each).cloud for each in (source, target))
     apart = rigid.apply(transform, source.points) - target.points[found.nearest]
     expected = np.where(source.mask, np.sum(np.square(apart), axis=1), np.inf)
     np.testing.assert_allclose(found.squared, expected, rtol=1e-4, atol=1e-9)
 
 
-def test_prepared_clouds_change_nothing(cloud):
-    source, target = _padded(cloud[::2]), _padded(cloud[50:])
-    prepared = _fit(*(jax.jit(prepare)(each) for each in (source, target)), _turn(5))
-    jax.tree.map(np.testing.assert_array_equal, prepared, _fit(source, target, _turn(5)))
-
-
 def test_padding_changes_nothing(cloud):
-    source, target = make_cloud(cloud), make_cloud(cloud + np.float32(0.03))
-    padded = _fit(_padded(source.points), _padded(target.points), _turn(5))
-    np.testing.assert_allclose(_fit(source, target, _turn(5)).shares, padded.shares, atol=1e-6)
+    clouds = cloud, cloud + np.float32(0.03)
+    less, more = (_fit(*(_padded(points, rows) for points in clouds), _turn(5)) for rows in (256, _ROWS))
+    np.testing.assert_allclose(less.shares, more.shares, atol=1e-6)
+    np.testing.assert_allclose(less.evidence, more.evidence, atol=1e-5)
+    np.testing.assert_allclose(less.squared[:200], more.squared[:200], rtol=1e-5)
+    assert not np.isfinite(more.squared[200:]).any()
+
+
+@pytest.mark.parametrize("degrees", [0, 40])
+def test_fit_of_even_samples_is_that_of_their_prepared_clouds(cloud, degrees):
+    """Of clouds that are their own even samples."""
+    clouds = [_padded(cloud[:100], 256), _padded(cloud[50:150] + np.float32(0.02), 256)]
+    samples = [_prepared(each).samples.even for each in clouds]
+    found, expected = jax.jit(fit_samples)(*samples, _turn(degrees)), _fit(*clouds, _turn(degrees))
+    np.testing.assert_allclose(found.shares, expected.shares, atol=1e-6)
+    np.testing.assert_allclose(found.uniqueness, expected.uniqueness, atol=1e-4)
+    np.testing.assert_allclose(np.sort(found.squared[:100]), np.sort(expected.squared[:100]), rtol=1e-4)
+
+
+def _agreement(poses: Rigid, source: np.ndarray, target: np.ndarray, reach: float) -> list[float]:
+    """By the definition: the mean over both directions of max(0, 1 − d²/r²)."""
+    scores = []
+    for rotation, translation in zip(*map(np.asarray, poses), strict=True):
+        moved = source @ rotation.T + translation
+        squared = np.sum((moved[:, None] - target) ** 2, axis=-1)
+        directions = [np.maximum(1 - squared.min(axis=axis) / reach**2, 0).mean() for axis in (0, 1)]
+        scores.append(np.mean(directions))
+    return scores
+
+
+@pytest.mark.parametrize("count", [1, 16, 21])
+def test_agreement_is_that_of_its_definition_for_any_number_of_poses(cloud, count):
+    source, target = cloud[:120], cloud[60:150] + np.float32(0.05)
+    turns = Rotation.random(count, random_state=0).as_matrix().astype(np.float32)
+    poses = Rigid(jnp.asarray(turns), jnp.asarray(np.random.default_rng(0).normal(0, 0.1, (count, 3)), jnp.float32))
+    clouds = make_cloud(source), _padded(target, 120)
+    found = agreement(poses, clouds, clouds, jnp.float32(0.4))
+    np.testing.assert_allclose(found, _agreement(poses, source, target, 0.4), atol=1e-5)
+
+
+def test_agreement_of_a_cloud_with_itself_is_one_and_with_nothing_zero(cloud):
+    poses = Rigid(jnp.stack([jnp.eye(3)] * 2), jnp.array([[0.0, 0, 0], [50, 0, 0]]))
+    clouds = (make_cloud(cloud),) * 2
+    np.testing.assert_allclose(agreement(poses, clouds, clouds, jnp.float32(0.1)), [1, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))

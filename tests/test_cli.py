@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -13,12 +14,14 @@ import pytest
 
 import urrt_jax
 from urrt_jax import cli, io
-from urrt_jax.cli.demo import demo_pair
-from urrt_jax.cli.printing import as_table
+from urrt_jax.cli.demo import Demo, demo_pair
+from urrt_jax.cli.printing import as_dict, as_table
 from urrt_jax.cli.train import NetworkFlags, PairFlags, Train
 from urrt_jax.data import demo_shape
 from urrt_jax.evaluation import load_evaluation
 from urrt_jax.model import ModelConfig
+from urrt_jax.programs import clear_programs
+from urrt_jax.result import Outcome
 from urrt_jax.training.loop import LoopConfig
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig
@@ -44,13 +47,20 @@ def files(tmp_path_factory, small_model) -> dict[str, Path]:
     return {name: folder / name for name in ("a.ply", "b.xyz", "model.npz")}
 
 
+@pytest.fixture(scope="module")
+def registration(files) -> urrt_jax.Registration:
+    """The result for the two clouds."""
+    clouds = (io.read_cloud(files[name]) for name in ("a.ply", "b.xyz"))
+    return urrt_jax.register(*clouds, model=urrt_jax.load_model(files["model.npz"]))
+
+
 def register(files: dict[str, Path], *flags: str, source: Path | None = None, target: Path | None = None) -> int:
     clouds = [str(source or files["a.ply"]), str(target or files["b.xyz"])]
     return cli.main(["register", *clouds, "--model", str(files["model.npz"]), *flags])
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["register"], ["demo"], ["train"], ["evaluate"], ["reproduce"]], ids=lambda c: "".join(c) or "urrt"
+    "command", [[], ["register"], ["demo"], ["train"], ["evaluate"]], ids=lambda c: "".join(c) or "urrt"
 )
 def test_help_answers_without_importing_jax(command):
     program = (
@@ -70,7 +80,7 @@ def test_help_answers_without_importing_jax(command):
 def test_json_is_one_object_with_exactly_the_promised_keys(files, capsys):
     assert register(files, "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    promised = "matrix rotation translation fitness rmse overlap confidence converged information"
+    promised = "matrix rotation translation fitness rmse overlap confidence converged reason information"
     assert list(found) == promised.split()
     matrix = np.array(found["matrix"])
     np.testing.assert_array_equal(matrix[:3, :3], found["rotation"])
@@ -81,6 +91,22 @@ def test_json_is_one_object_with_exactly_the_promised_keys(files, capsys):
     assert len(found["overlap"]) == 2 and np.shape(found["information"]) == (6, 6)
 
 
+@pytest.mark.parametrize("field", ["fitness", "rmse", "overlap", "confidence", "information"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_json_has_null_for_a_number_that_is_not_finite(registration, field, value):
+    whole = np.asarray(getattr(registration, field))
+    first = dataclasses.replace(
+        registration, **{field: np.where(np.arange(whole.size).reshape(whole.shape), whole, value)}
+    )
+    found = json.loads(json.dumps(as_dict(first), allow_nan=False))
+    expected = as_dict(registration)
+    assert np.ravel(np.array(found[field], object))[0] is None
+    np.testing.assert_array_equal(np.ravel(found[field])[1:], np.ravel(expected[field])[1:])
+    assert {name: each for name, each in found.items() if name != field} == {
+        name: each for name, each in expected.items() if name != field
+    }
+
+
 def test_table_shows_the_transform_and_the_diagnostics(files, capsys):
     assert register(files) == 0
     out = capsys.readouterr().out
@@ -89,11 +115,22 @@ def test_table_shows_the_transform_and_the_diagnostics(files, capsys):
         assert word in out
 
 
-def test_a_failure_is_said_plainly(files):
-    clouds = (io.read_cloud(files[name]) for name in ("a.ply", "b.xyz"))
-    result = urrt_jax.register(*clouds, model=urrt_jax.load_model(files["model.npz"]))
-    assert "do not rely on this transform" in as_table(dataclasses.replace(result, converged=np.array(False)))
-    assert "do not rely" not in as_table(dataclasses.replace(result, converged=np.array(True)))
+def test_a_failure_is_said_with_its_reason(registration):
+    failed = dataclasses.replace(registration, converged=np.array(False), outcome=np.array(Outcome.AMBIGUOUS))
+    assert as_table(failed).endswith("converged    NO       " + failed.reason)
+    assert as_dict(failed)["reason"] == failed.reason
+    found = dataclasses.replace(registration, converged=np.array(True), outcome=np.array(Outcome.CONVERGED))
+    assert as_table(found).endswith("converged    yes")
+
+
+def test_a_terminal_is_told_once_that_programs_are_compiled(files, capsys, monkeypatch):
+    clear_programs()
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    told = []
+    for _ in range(2):
+        assert register(files, "--json", "--no-refine") == 0
+        told.append(capsys.readouterr().err)
+    assert told[0].startswith("urrt: compiling, once for clouds of up to 256 points\n") and told[1] == ""
 
 
 @pytest.mark.parametrize("extension", ["ply", "xyz", "npy"])
@@ -118,7 +155,8 @@ def test_map_coordinates_cost_no_digits(files, capsys, tmp_path):
         out = tmp_path / "moved.ply"
         assert register(files, "--out", str(out), source=tmp_path / "a.ply", target=tmp_path / "b.ply") == 0
         moved.append(io.read_cloud(out) - offsets[1])
-    np.testing.assert_allclose(moved[1], moved[0], atol=1e-5)
+    # One normal here hangs on the last bit, which moves the pose by 6e-4; float32 coordinates would be off by 0.25.
+    np.testing.assert_allclose(moved[1], moved[0], atol=2e-3)
 
 
 def test_no_refine_gives_the_networks_own_estimate(files, capsys):
@@ -172,6 +210,14 @@ def test_a_missing_folder_for_the_output_is_named_before_any_work(files, capsys,
     assert "nowhere" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("samples", ["0", "-1", "10000001", "1000000000000"])
+def test_samples_out_of_range_are_named_before_any_work(files, capsys, monkeypatch, samples):
+    monkeypatch.setattr("urrt_jax.io.read_cloud", lambda *_, **__: pytest.fail("the clouds were read first"))
+    assert register(files, "--samples", samples) == 2
+    error = capsys.readouterr().err
+    assert error == f"urrt: error: --samples: expected a whole number from 1 to 10,000,000, got {samples}\n"
+
+
 def test_debugging_shows_the_traceback(files, monkeypatch):
     monkeypatch.setenv("URRT_DEBUG", "1")
     with pytest.raises(FileNotFoundError):
@@ -193,7 +239,8 @@ def test_compiled_programs_are_kept_and_the_second_run_is_silent_about_it(files,
     first, second = (
         subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)
     )
-    assert any(path.is_file() for path in (tmp_path / "urrt_jax").rglob("*"))
+    assert list((tmp_path / "urrt_jax" / "programs").glob("*.program"))
+    assert not (tmp_path / "urrt_jax" / "jax").exists()
     assert json.loads(first.stdout) == json.loads(second.stdout)
     assert first.stderr == second.stderr == ""
 
@@ -203,8 +250,23 @@ def test_an_unusable_cache_folder_does_not_matter(tmp_path, monkeypatch):
     monkeypatch.delenv("URRT_NO_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     before = jax.config.jax_compilation_cache_dir
-    cli._keep_compiled_programs()
+    cli._keep_compiled_programs(Train(out=tmp_path))
     assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_training_keeps_what_jax_compiles_beside_the_programs(tmp_path, monkeypatch):
+    kept = {}
+    monkeypatch.delenv("URRT_NO_CACHE")
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("urrt_jax.program_cache._cache", None)
+    monkeypatch.setattr(jax.config, "update", kept.__setitem__)
+    cli._keep_compiled_programs(Demo())
+    assert not kept
+    cli._keep_compiled_programs(Train(out=tmp_path))
+    folder = Path(kept["jax_compilation_cache_dir"])
+    assert folder.is_dir() and folder.parent == tmp_path / "urrt_jax" / "jax"
+    assert version("jaxlib") in folder.name
 
 
 def test_demo_writes_its_picture_and_says_where(files, capsys, tmp_path):
@@ -339,35 +401,3 @@ def test_evaluate_refuses_what_it_cannot_do_before_any_work(files, capsys, tmp_p
     assert cli.main(["evaluate", *common, *flags]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_reproduce_writes_a_table_of_ones_own(files, capsys, tmp_path):
-    own = tmp_path / "own"
-    own.mkdir()
-    (own / "config.toml").write_text(
-        'title = "Mine"\nmethods = ["identity", "register"]\ncolumns = ["mae_rotation"]\n'
-        '[[parts]]\ntitle = "clean"\nprotocol = "dcp"\npoints = 100\n'
-    )
-    flags = ["--model", str(files["model.npz"]), "--limit", "2", "--out", str(tmp_path / "out")]
-    assert cli.main(["reproduce", str(own), *flags]) == 0
-    assert "# Mine" in capsys.readouterr().out
-    results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert [row["method"] for row in results["parts"][0]["rows"]] == ["identity", "register"]
-    assert str(tmp_path) not in json.dumps(results)
-
-    kept, anew = results["parts"][0]["rows"]
-    anew["mae_rotation"] = kept["mae_rotation"] = 123.0
-    (tmp_path / "out" / "results.json").write_text(json.dumps(results))
-    assert cli.main(["reproduce", str(own), *flags, "--only", "register"]) == 0
-    results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert [row["mae_rotation"] == 123.0 for row in results["parts"][0]["rows"]] == [True, False]
-
-
-def test_reproduce_draws_pictures_as_a_whole(capsys):
-    assert cli.main(["reproduce", "figure4", "--only", "register"]) == 2
-    assert "--only: figure4_qualitative is drawn as a whole" in capsys.readouterr().err
-
-
-def test_reproduce_refuses_an_unknown_table(capsys):
-    assert cli.main(["reproduce", "table9"]) == 2
-    assert "table3_comparison" in capsys.readouterr().err

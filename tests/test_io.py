@@ -102,6 +102,20 @@ def test_mesh_is_read_with_all_its_faces(tmp_path, box, extension):
     assert mesh.area == pytest.approx(22)
 
 
+@pytest.mark.parametrize("samples", [0, -1, 10_000_001, 10**12, 1e3, True, None])
+@pytest.mark.parametrize("extension", ["off", "npy"], ids=["mesh", "points"])
+def test_samples_out_of_range_are_refused(tmp_path, box, points, extension, samples):
+    file = tmp_path / f"file.{extension}"
+    box.export(file) if extension == "off" else write_cloud(file, points)
+    with pytest.raises(ValueError, match=rf"^samples: expected a whole number from 1 to 10,000,000, got {samples}$"):
+        read_cloud(file, samples=samples)
+
+
+def test_one_sample_is_enough(tmp_path, box):
+    box.export(tmp_path / "box.off")
+    assert read_cloud(tmp_path / "box.off", samples=1).shape == (1, 3)
+
+
 def test_surface_samples_are_area_uniform_and_inside_their_triangles():
     # A large, a small and a flat triangle: 9 : 1 : 0 in area, in three planes.
     corners = np.array([[[0, 0, 0], [3, 0, 0], [0, 3, 0]], [[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[0, 0, 2]] * 3], float)
@@ -302,6 +316,8 @@ def test_a_transform_may_be_rows_of_json(tmp_path):
         ("pose.json", '{"fitness": 1}'),
         ("pose.json", "[1, 2"),
         ("pose.json", '[["a"]]'),
+        ("pose.json", '{"matrix": [[null, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}'),
+        ("pose.txt", "nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
         ("pose.npy", "text"),
     ],
 )

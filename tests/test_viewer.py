@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from urrt_jax.geometry.rigid import Rigid
-from urrt_jax.registration import Registration
+from urrt_jax.result import Outcome, Registration
+from urrt_jax.rigid import Rigid
 from urrt_jax.viewer import plot_registration, region_colors, show_registration
 
 
@@ -24,6 +24,7 @@ def registration(source: np.ndarray, target: np.ndarray, *, converged: bool = Tr
         overlap=jnp.array([0.75, 0.8]),
         confidence=jnp.array(0.9),
         converged=jnp.array(converged),
+        outcome=jnp.array(Outcome.CONVERGED if converged else Outcome.MISFIT, jnp.int32),
         correspondences=jnp.zeros(len(source), jnp.int32),
         information=jnp.eye(6),
         source_regions=jnp.asarray(octants[0]),

@@ -8,19 +8,19 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.neighbors import coarser_spacing, nearest
-from urrt_jax.geometry.normals import least_axis
-from urrt_jax.geometry.prepared import Prepared, prepare
-from urrt_jax.geometry.rigid import Rigid, nearest_rotation
+from urrt_jax import rigid
+from urrt_jax.clouds import Cloud, first, thin
+from urrt_jax.clouds.normals import least_axis
+from urrt_jax.neighbors import Blocks, Neighbors, coarser_spacing, nearest
+from urrt_jax.prepared import Prepared
+from urrt_jax.rigid import Rigid, cross, nearest_rotation
 
 _HIGHEST = jax.lax.Precision.HIGHEST
 _RINGS = (1.0, 1.5, 3.0)  # spacings of the coarser cloud: close, touching (samples of one surface do), and about
 _CLOSE, _TOUCHING, _ABOUT = range(3)
-_BEYOND = 1.001  # times the farthest distance that counts: what lies just there is seen
-_ASKED = 4096  # points of a large target
-_TURNED, _TURNED_ASKED = 512, 128  # points of a cloud that is turned, and of those that ask
+_BEYOND = 1.001  # neighbours are looked for a little farther than the farthest distance that counts
+_TURNED, _TURNED_QUERIES = 512, 128  # points of a cloud that is turned, and those of them that look for a neighbour
+_AT_ONCE = 16  # poses that are compared at once
 _QUARTER = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
 _TURNS = np.array([np.linalg.matrix_power(np.roll(_QUARTER, (k, k), (0, 1)), n) for k in range(3) for n in (1, 2, 3)])
 ASSESSED = {"overlap": 3.0, "tightness": 4.0, "closeness": 4.2, "uniqueness": 8.3}
@@ -34,15 +34,15 @@ class Fit(NamedTuple):
     """How a moved source lies on its target.
 
     Attributes:
-      squared: (N,), from every source point to the nearest target point; inf for padding, and where none is near.
-      nearest: (N,) int32, that point's row, where there is one.
+      nearest: (N,) int32, the row of the target point nearest to every source point, where there is one.
+      squared: (N,), the squared distance to it; inf for padding, and where none is near.
       touching: (), the distance within which points touch: 1.5 spacings of the coarser cloud.
       shares: (2, 3), of the source's points and of the target's: how many lie within 1, 1.5 and 3 spacings.
-      uniqueness: (), from -1 to 1: how much more of both clouds agrees than after the best of some turns.
+      uniqueness: (), from -1 to 1: how much better both clouds agree than after the best of some further turns.
     """
 
-    squared: Array
     nearest: Array
+    squared: Array
     touching: Array
     shares: Array
     uniqueness: Array
@@ -54,53 +54,101 @@ class Fit(NamedTuple):
 
     @property
     def evidence(self) -> Array:
-        """(4,), in the order of ``ASSESSED``: what surfaces do that lie on each other, and in no other way.
+        """(4,), in the order of ``ASSESSED``: what tells surfaces that lie on each other from surfaces that cross.
 
-        The larger overlap; the share of the points that come near which touch; the share of those which are close; the
-        uniqueness.
+        The larger overlap; the share of touching points among those that come near; the share of close points among
+        those that touch; the uniqueness.
         """
         close, touching, about = jnp.sum(self.shares, axis=0)
         tightness, closeness = touching / jnp.maximum(about, 1e-3), close / jnp.maximum(touching, 1e-3)
         return jnp.stack([jnp.max(self.overlap), tightness, closeness, self.uniqueness])
 
     @property
+    def surfaces(self) -> Array:
+        """(), the logit of the confidence less what the uniqueness adds: how well the surfaces lie on each other."""
+        weights = jnp.array([ASSESSED[name] for name in ("overlap", "tightness", "closeness")])
+        return BIAS + self.evidence[:3] @ weights
+
+    @property
     def confidence(self) -> Array:
         """(), from 0 to 1: how sure it is that surfaces lie on each other rather than cross, and in this pose alone."""
-        return jax.nn.sigmoid(BIAS + self.evidence @ jnp.array(list(ASSESSED.values())))
+        return jax.nn.sigmoid(self.surfaces + ASSESSED["uniqueness"] * self.uniqueness)
 
 
-def fit(source: Cloud | Prepared, target: Cloud | Prepared, transform: Rigid, reach: Array | float = 0.0) -> Fit:
-    """The fit of the source, moved by ``transform``, on the target.
+def fit(source: Prepared, target: Prepared, transform: Rigid, reach: Array | float = 0.0) -> Fit:
+    """The fit of the source, moved by ``transform``, on the target; no derivative passes.
 
-    Neighbours are looked for within 3 spacings of the coarser cloud, or within ``reach``, where that is more.
+    Args:
+      source: N points.
+      target: N points, padded as far as the source; its thinned cloud looks for neighbours in the source.
+      transform: source to target.
+      reach: (), neighbours of source points are looked for within 3 spacings of the coarser cloud, or within this.
     """
-    source, target = prepare(source), prepare(target)
-    width = jax.lax.stop_gradient(jnp.maximum(source.spacing, target.spacing))
-    mask = source.cloud.mask
-    rings = width * jnp.array(_RINGS)
-    within = _BEYOND * jnp.maximum(rings[_ABOUT], reach)
-    moved = rigid.apply(transform, source.cloud.points)
-    index, squared = nearest(moved, target.reference, within=within, order=source.order)
-    some = target.thin(_ASKED)
-    asked = rigid.apply(rigid.inverse(transform), some.points)
-    back = nearest(asked, source.reference, within=_BEYOND * rings[_ABOUT]).squared
-    shares = [
-        jax.vmap(lambda ring, mask=mask, squared=squared: inlier_share(mask, squared, ring)[0])(rings)
-        for mask, squared in ((mask, squared), (some.mask, back))
-    ]
-    far = jnp.where(mask, squared, jnp.inf)
-    return Fit(far, index, _RINGS[_TOUCHING] * width, jnp.stack(shares), _uniqueness(source, target, transform))
+    source, target, transform = jax.lax.stop_gradient((source, target, transform))
+    width = jnp.maximum(source.spacing, target.spacing)
+    reaches = jnp.stack([jax.lax.stop_gradient(jnp.asarray(reach, width.dtype)), jnp.zeros_like(width)])
+    queries = source.cloud, first(target.samples.thinned, source.cloud.mask.shape[0])
+    found, shares = _look(
+        (source.cloud, target.cloud), queries, transform, width, reaches, source.blocks, target.blocks
+    )
+    clouds, asked = (
+        tuple(thin(each.cloud, count, ordered=True) for each in (source, target))
+        for count in (_TURNED, _TURNED_QUERIES)
+    )
+    far = jnp.where(source.cloud.mask, found.squared[0], jnp.inf)
+    return Fit(found.index[0], far, _RINGS[_TOUCHING] * width, shares, _uniqueness(clouds, asked, transform))
 
 
-def _uniqueness(source: Prepared, target: Prepared, transform: Rigid) -> Array:
+def fit_samples(source: Cloud, target: Cloud, transform: Rigid) -> Fit:
+    """The fit of even samples of both clouds (``subsample``), of one size, which is quick. Arguments as for ``fit``."""
+    source, target, transform = jax.lax.stop_gradient((source, target, transform))
+    clouds = source, target
+    width = coarser_spacing(*clouds)
+    found, shares = _look(clouds, clouds, transform, width, jnp.zeros(2, width.dtype))
+    # The first points of a farthest-point sample are an even sample, too.
+    asked = first(source, _TURNED_QUERIES), first(target, _TURNED_QUERIES)
+    far = jnp.where(source.mask, found.squared[0], jnp.inf)
+    return Fit(found.index[0], far, _RINGS[_TOUCHING] * width, shares, _uniqueness(clouds, asked, transform))
+
+
+def _look(
+    clouds: tuple[Cloud, Cloud],
+    queries: tuple[Cloud, Cloud],
+    transform: Rigid,
+    width: Array,
+    reaches: Array,
+    *blocks: Blocks | None,
+) -> tuple[Neighbors, Array]:
+    """The neighbours of either cloud's queries in the other cloud (2, Q), and how many lie within each ring, (2, 3)."""
+    rings = width * jnp.array(_RINGS, width.dtype)
+    within = _BEYOND * jnp.maximum(rings[_ABOUT], reaches)
+    points = rigid.apply(transform, queries[0].points), rigid.apply(rigid.inverse(transform), queries[1].points)
+    ours, theirs = ((cloud, block) for cloud, block in zip(clouds, blocks or (None, None), strict=True))
+    masks = jnp.stack([each.mask for each in queries])
+
+    def look(side: tuple) -> Neighbors:
+        points, (cloud, block), within, count = side
+        return nearest(points, cloud, blocks=block, within=within, ordered=True, count=count)
+
+    # A loop over the two directions: the search is compiled once.
+    sides = (
+        jnp.stack(points),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), theirs, ours),
+        within,
+        jnp.sum(masks, axis=1),
+    )
+    found = jax.lax.map(look, sides)
+    near = masks[..., None] & (found.squared[..., None] <= rings**2)
+    return found, jnp.sum(near, axis=1) / jnp.maximum(jnp.sum(masks, axis=1), 1)[:, None]
+
+
+def _uniqueness(clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...], transform: Rigid) -> Array:
     """By how much the agreement after ``transform`` exceeds that after further turns, (), from -1 to 1.
 
-    Shapes are mistaken for themselves turned by a half or a quarter, about an axis of symmetry or nearly so, which is a
-    principal one: the nine such turns about the principal axes of both clouds together, through their centre.
+    A shape is mistaken for itself turned by a half or a quarter about an axis of symmetry, exact or nearly so, which is
+    a principal axis. Tried are the nine such turns about the principal axes of both clouds together, through their
+    centre.
     """
-    source, target, transform = jax.tree.map(jax.lax.stop_gradient, (source, target, transform))
-    clouds = source.thin(_TURNED), target.thin(_TURNED)
-    asked = source.thin(_TURNED_ASKED), target.thin(_TURNED_ASKED)
     moved = clouds[0]._replace(points=rigid.apply(transform, clouds[0].points))
     together = Cloud(*(jnp.concatenate(both) for both in zip(moved, clouds[1], strict=True)))
     share = together.mask / jnp.maximum(jnp.sum(together.mask), 1)
@@ -111,36 +159,51 @@ def _uniqueness(source: Prepared, target: Prepared, transform: Rigid) -> Array:
     turned = jnp.matmul(axes, jnp.matmul(_TURNS, axes.T, precision=_HIGHEST), precision=_HIGHEST)
     rotations = jnp.concatenate([jnp.eye(3)[None], turned])
     turns = Rigid(rotations, centre - rigid.rotate(rotations, centre))
-    reach = coarser_spacing(*clouds)
-    agreements = jax.vmap(lambda turn: agreement(rigid.compose(turn, transform), clouds, asked, reach))(turns)
+    poses = jax.vmap(lambda turn: rigid.compose(turn, transform))(turns)
+    agreements = agreement(poses, clouds, asked, coarser_spacing(*clouds))
     return agreements[0] - jnp.max(agreements[1:])
 
 
 def _principal_axes(moment: Array) -> Array:
     """Principal axes of a symmetric matrix (3, 3), the columns of a rotation; any where it has none."""
-    least, greatest = least_axis(moment), least_axis(jnp.trace(moment) * jnp.eye(3) - moment)
-    return nearest_rotation(jnp.stack([greatest, jnp.cross(least, greatest), least], axis=1))
+    least, greatest = jax.vmap(least_axis)(jnp.stack([moment, jnp.trace(moment) * jnp.eye(3) - moment]))
+    return nearest_rotation(jnp.stack([greatest, cross(least, greatest), least], axis=1))
 
 
-def agreement(transform: Rigid, clouds: tuple[Cloud, Cloud], asked: tuple[Cloud, Cloud], reach: Array) -> Array:
-    """How well two clouds lie on each other, (): the mean over both directions of max(0, 1 − d²/r²), in [0, 1].
+def agreement(poses: Rigid, clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...], reach: Array) -> Array:
+    """How well two clouds lie on each other in each of H poses, (H,): the mean of max(0, 1 − d²/r²), in [0, 1].
+
+    The mean is over the queries of both directions. Poses are compared a few at a time, which bounds memory.
 
     Args:
-      transform: source to target.
-      clouds: source and target.
-      asked: some of their points, whose distances d to the other cloud are counted.
+      poses: source to target, rotation (H, 3, 3) and translation (H, 3).
+      clouds: source and target, of N rows each.
+      asked: queries, Q points of each cloud, whose distances d to the other cloud count.
       reach: r, ().
     """
+    count = poses.rotation.shape[0]
+    few = min(_AT_ONCE, count)
+    # Whole chunks only: what is left over would be compiled a second time.
+    filled = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -count % few, axis=0)]), poses)
+    chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, few, *leaf.shape[1:]), filled)
+    sides = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
+    masks = jnp.stack([each.mask for each in asked])
 
-    def share(points: Array, mask: Array, other: Cloud) -> Array:
-        squared = nearest(points, other).squared
-        closeness = jnp.where(mask & jnp.isfinite(squared), jnp.maximum(1 - squared / reach**2, 0.0), 0.0)
-        return jnp.sum(closeness) / jnp.maximum(jnp.sum(mask), 1)
+    def compare(some: Rigid) -> Array:
+        moved = jax.vmap(rigid.apply, (0, None))(some, asked[0].points)
+        back = jax.vmap(rigid.apply, (0, None))(jax.vmap(rigid.inverse)(some), asked[1].points)
+        placed = jnp.stack([moved, back]).reshape(2, -1, 3)
 
-    (source, target), (ask_source, ask_target) = clouds, asked
-    forth = share(rigid.apply(transform, ask_source.points), ask_source.mask, target)
-    back = share(rigid.apply(rigid.inverse(transform), ask_target.points), ask_target.mask, source)
-    return (forth + back) / 2
+        def look(side: Array) -> Array:
+            other = jax.tree.map(lambda leaf: leaf[1 - side], sides)
+            return nearest(placed[side], other).squared
+
+        squared = jax.lax.map(look, jnp.arange(2)).reshape(2, few, -1)
+        close = jnp.where(jnp.isfinite(squared), jnp.maximum(1 - squared / reach**2, 0.0), 0.0)
+        totals = jnp.sum(jnp.where(masks[:, None], close, 0.0), axis=2)
+        return jnp.mean(totals / jnp.maximum(jnp.sum(masks, axis=1), 1)[:, None], axis=0)
+
+    return jax.lax.map(compare, chunks).reshape(-1)[:count]
 
 
 def inlier_share(mask: Array, squared: Array, reach: Array) -> tuple[Array, Array]:

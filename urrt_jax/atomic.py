@@ -1,6 +1,7 @@
 """Writing a file whole or not at all."""
 
 import os
+import secrets
 from pathlib import Path
 
 
@@ -11,8 +12,8 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> None
       OSError: the folder does not exist or can't be written; the message names ``path``.
     """
     path = Path(path)
-    # In the same folder, because a move is atomic only within one file system.
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # In the same folder, because a move is atomic only within one file system; machines may share it.
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
     try:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
         os.replace(unfinished, path)

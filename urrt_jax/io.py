@@ -29,6 +29,9 @@ MESH_FORMATS = (".obj", ".off", ".ply", ".stl")
 CLOUD_FORMATS = (".npy", ".npz", ".pcd", ".xyz")
 """Extensions that hold points and nothing else."""
 
+MAX_SAMPLES = 10_000_000
+"""The most points that `read_cloud` draws on a mesh: 240 MB of coordinates. The bound stops a mistyped number."""
+
 
 def read_cloud(path: str | os.PathLike[str], *, samples: int = 20_000) -> np.ndarray:
     """The cloud in a file, as (N, 3) coordinates in the file's own units and frame.
@@ -39,20 +42,29 @@ def read_cloud(path: str | os.PathLike[str], *, samples: int = 20_000) -> np.nda
     Args:
         path: a `.ply`, `.obj`, `.off`, `.stl`, `.xyz`, `.npy`, `.npz` or `.pcd` file. `.xyz` gives its first three
             columns (`#` starts a comment); `.npz` its array `points`, else its only array of shape (N, 3).
-        samples: how many points to draw on a mesh with faces.
+        samples: how many points to draw on a mesh with faces, from 1 to 10,000,000.
 
     Returns:
         (N, 3), float32 where the file stores single-precision arrays (`.npy`, `.npz`, `.pcd`), else float64.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file's extension is unknown, or it is unreadable, truncated, empty or holds non-finite values.
+        ValueError: `samples` is not a whole number in that range, or the file's extension is unknown, or the file is
+            unreadable, truncated, empty or holds non-finite values.
         ImportError: a `.pcd` file, and `pypcd4` (extra `urrt-jax[data]`) is not installed.
     """
+    check_samples(samples)
     geometry = read_geometry(path)
     if isinstance(geometry, np.ndarray):
         return geometry
     return sample_surface(geometry.triangles, samples, np.random.default_rng(0))
+
+
+def check_samples(samples: int, *, name: str = "samples") -> None:
+    """Raises a `ValueError` that names the option unless `samples` is a whole number from 1 to `MAX_SAMPLES`."""
+    whole = isinstance(samples, int | np.integer) and not isinstance(samples, bool)
+    if not whole or not 1 <= samples <= MAX_SAMPLES:
+        raise ValueError(f"{name}: expected a whole number from 1 to {MAX_SAMPLES:,}, got {samples!r}")
 
 
 def read_mesh(path: str | os.PathLike[str]) -> trimesh.Trimesh:
@@ -109,7 +121,7 @@ def read_transform(path: str | os.PathLike[str]) -> np.ndarray:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it holds no (4, 4) matrix of numbers.
+        ValueError: it holds no (4, 4) matrix of finite numbers.
     """
     path = Path(path)
     if not path.exists():
@@ -127,6 +139,8 @@ def read_transform(path: str | os.PathLike[str]) -> np.ndarray:
         raise ValueError(f"{path}: holds no matrix of 4 rows and 4 columns ({error})") from error
     if matrix.shape != (4, 4):
         raise ValueError(f"{path}: expected a matrix of shape (4, 4), got {matrix.shape}")
+    if not np.isfinite(matrix).all():  # `null` in a .json becomes NaN
+        raise ValueError(f"{path}: expected a matrix of finite numbers, got {matrix.tolist()}")
     return matrix
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from urrt_jax.registration import Registration
+from urrt_jax.result import Registration
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

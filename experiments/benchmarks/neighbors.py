@@ -27,10 +27,9 @@ from scipy.spatial.transform import Rotation
 from timing import median_seconds
 from tqdm import tqdm
 
+from urrt_jax.clouds import make_cloud
 from urrt_jax.data import demo_shape
-from urrt_jax.geometry.blocks import make_blocks
-from urrt_jax.geometry.clouds import make_cloud
-from urrt_jax.geometry.neighbors import LARGE, nearest
+from urrt_jax.neighbors import LARGE, make_blocks, nearest
 
 HERE = Path(__file__).parent
 BATCH = 64
@@ -53,7 +52,8 @@ def by_matrix(query: jax.Array, points: jax.Array) -> jax.Array:
 
 
 def in_blocks(query: jax.Array, points: jax.Array) -> jax.Array:
-    return nearest(query, make_blocks(make_cloud(points))).squared
+    cloud = make_cloud(points)
+    return nearest(query, cloud, blocks=make_blocks(cloud)).squared
 
 
 def with_jaxkd(query: jax.Array, points: jax.Array) -> jax.Array:

@@ -11,6 +11,7 @@ Peers are optional: `pip install 'urrt-jax[peers]'`; Debian: libusb-1.0-0 libgl1
 """
 
 import argparse
+import functools
 import json
 import os
 import platform
@@ -29,10 +30,10 @@ from scipy.spatial.transform import Rotation
 from timing import median_seconds
 from tqdm import tqdm
 
-from urrt_jax import Search, load_model, model_card, pad_clouds, register
+from urrt_jax import Search, load_model, model_card, register, register_pairs
+from urrt_jax.clouds import make_cloud
 from urrt_jax.data import demo_shape, find_data, load_shapes
 from urrt_jax.evaluation import PROTOCOLS, load_scan_pairs, pose_errors, rotation_degrees, summarize
-from urrt_jax.geometry.clouds import make_cloud
 from urrt_jax.io import write_cloud
 from urrt_jax.model.network import predict
 from urrt_jax.peers import PEERS
@@ -83,15 +84,11 @@ def measure_large(size: int) -> dict:
 def measure_scans(path: Path) -> list[dict]:
     """`register` with search, and peers, on the same pairs of scans of some 40,000 points, one pair a call."""
     data, _ = load_scan_pairs(path)
-    # One padded size: the program is compiled once, as for any stream of scans.
     trials = data[:SCAN_PAIRS]
-    size = max(len(cloud) for trial in trials for cloud in trial[:2])
     single, errors = [], []
     for trial in tqdm([trials[0], *trials], desc="scans"):
-        (source, target), (source_mask, target_mask) = pad_clouds([trial.source, trial.target], size=size)
         start = time.perf_counter()
-        masks = {"source_mask": source_mask, "target_mask": target_mask}
-        found = jax.block_until_ready(register(source, target, **masks, search=Search()))
+        found = jax.block_until_ready(register(trial.source, trial.target, search=Search()))
         single.append(time.perf_counter() - start)
         errors.append(float(rotation_degrees(found.rotation, trial.rotation)))
     share = float(np.mean(np.array(errors[1:]) < 1))
@@ -165,9 +162,9 @@ def measure(data: str, pairs: int, repeats: int) -> dict:
     model = load_model()
 
     network = jax.jit(jax.vmap(lambda a, b: predict(model, make_cloud(a), make_cloud(b))))
-    refined = jax.jit(jax.vmap(lambda a, b: register(a, b, model=model)))
-    batches: list[tuple[jax.Array, jax.Array]] = [
-        (jnp.asarray(sources[start : start + BATCH]), jnp.asarray(targets[start : start + BATCH]))
+    refined = functools.partial(register_pairs, model=model, batch=BATCH)
+    batches = [
+        (sources[start : start + BATCH], targets[start : start + BATCH])
         for start in range(0, len(sources) - BATCH + 1, BATCH)
     ]
     count = BATCH * len(batches)

@@ -1,9 +1,10 @@
-"""Where the time of a batched `register` goes, stage by stage, and how near the hot loop is to what the machine can do.
+"""Where the time of a batch of `register_pairs` goes, stage by stage, and how near its hot loop is to the limit.
 
     python experiments/benchmarks/stages.py --data PATH
 
-Batches of 32 clean pairs of 1,024 points from the test split. Every stage is compiled and timed alone, on what the
-stages before it give, so that their sum and the whole differ a little. The hot loop, the placing of landmarks, compares
+Batches of 32 clean pairs of 1,024 points from the test split, without search. Every stage is a program of its own
+(urrt_jax/stages.py), timed on what the stages before it give; the whole also copies and pads on the host. Parts of a
+stage, marked –, are compiled for themselves. The hot loop, the placing of landmarks, compares
 every query with every key: its rate is set against that of one large product of matrices, and what it would move, were
 no logit kept in a cache, against that of a copy, both measured in the same run. Writes stages.json and stages.md beside
 this file.
@@ -16,26 +17,25 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from timing import median_seconds
 
-from urrt_jax import ICP, load_model, register
-from urrt_jax.assessment import fit
+from urrt_jax import ICP, register_pairs
+from urrt_jax.clouds import first, normals
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import PROTOCOLS
 from urrt_jax.features.moments import moment_invariants
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair, subsample
-from urrt_jax.geometry.normals import normals
-from urrt_jax.geometry.prepared import prepare
+from urrt_jax.host import PairOnHost
 from urrt_jax.model.consensus import align_landmarks, even_seeds
 from urrt_jax.model.encoding import encode_cloud
 from urrt_jax.model.landmarks import place_landmarks
-from urrt_jax.model.network import estimate
-from urrt_jax.refine import icp
-from urrt_jax.registration import STEPS_BEFORE_REFINEMENT
+from urrt_jax.programs import Program
+from urrt_jax.registration import make_options
+from urrt_jax.stages import approach, assess, estimate, expect, label, prepare, rung, settle, sizes_of
 
 HERE = Path(__file__).parent
 BATCH = 32
@@ -50,20 +50,12 @@ def milliseconds(function: Callable, *inputs: object, repeats: int = 7, batch: i
 def measure(data: str) -> dict:
     shapes = load_shapes(data, split="test", points=1024, limit=BATCH)
     trials = [PROTOCOLS["dcp"](shapes.points, item) for item in range(BATCH)]
-    sources, targets = (
-        jnp.asarray(np.stack(each)) for each in list(zip(*(trial[:2] for trial in trials), strict=True))
-    )
-    model = load_model().at_most(STEPS_BEFORE_REFINEMENT)
+    pairs = [PairOnHost(trial.source, trial.target) for trial in trials]
+    padded = [pair.padded(rung(pair.size)) for pair in pairs]
+    source, target, told = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
+    options = make_options(None, ICP(), None)
+    model, refine, sizes = options.model, ICP(), sizes_of(options)
     config, params = model.config, model.params
-
-    @jax.vmap
-    def ready(a, b):
-        source, target, _ = normalize_pair(make_cloud(a), make_cloud(b))
-        return prepare(source), prepare(target)
-
-    @jax.vmap
-    def smaller(pair):
-        return tuple(subsample(each.cloud, config.points) for each in pair)
 
     @jax.vmap
     def surroundings(pair):
@@ -82,36 +74,47 @@ def measure(data: str) -> dict:
         seeds = even_seeds([here.shape[0] - 2 * config.lookups, config.lookups, config.lookups], config.hypotheses)
         return align_landmarks(here, there, weights, rounds=config.consensus, seeds=seeds)
 
-    prepared = jax.jit(ready)(sources, targets)
-    small = jax.jit(smaller)(prepared)
+    @jax.vmap
+    def normal(pair):
+        return [normals(each.queries.points, each.queries, 3 * each.spacing, jnp.zeros(3)) for each in pair]
+
+    ready = [prepare.batched(sizes, cloud) for cloud in (source, target)]
+    samples = [each.samples for each in ready]
+    small = tuple(jax.vmap(lambda cloud: first(cloud, config.points))(each.even) for each in samples)
     invariants = jax.jit(surroundings)(small)
     encoded = jax.jit(encoding)(small[0], invariants[0])
     count = config.regions * config.landmarks + config.lookups
     queries = config.sharpness * jnp.tile(encoded.keys, (1, 2, 1))[:, :count]
     landmarks = jnp.tile(encoded.lookups.places, (1, 3, 1))[:, : count + config.lookups]
     others = landmarks + 0.01 * jax.random.normal(jax.random.key(0), landmarks.shape)
-    estimated = jax.vmap(lambda source, target: estimate(model, source, target).transform)
-    answer = jax.jit(estimated)(*small)
+    start = estimate.batched(model, *samples, told)
+    looked = (refine, False), *samples, (ready[0].count, ready[1].count), start.transform
+    found = approach.batched(*looked).found
+    settled = settle.batched(refine, *ready, found.transform, found.width)
+    last = expect.batched(refine, *ready, settled)
 
-    def normal(pair):
-        return [normals(each.cloud.points, each.cloud, 3 * each.spacing, jnp.zeros(3)) for each in pair]
+    def took(program: Program, *inputs: Any) -> float:
+        return 1e3 * median_seconds(lambda: jax.block_until_ready(program.batched(*inputs)), 7) / BATCH
 
-    def refined(source, target, start, small):
-        return icp(source, target, start, ICP(), small=small)
+    def whole() -> None:
+        register_pairs([trial.source for trial in trials], [trial.target for trial in trials], search=None, batch=BATCH)
 
     place = milliseconds(placing, queries, encoded.keys, small[0])
     stages = {
-        "normalise, spacing": milliseconds(ready, sources, targets),
-        "farthest points": milliseconds(smaller, prepared),
-        "surroundings of both clouds": milliseconds(surroundings, small),
-        "the network's steps": milliseconds(estimated, *small),
+        "prepare both clouds": took(prepare, sizes, source) + took(prepare, sizes, target),
+        "– normals of both clouds": milliseconds(normal, tuple(ready)),
+        "the network's steps": took(estimate, model, *samples, told),
+        "– surroundings of both clouds": milliseconds(surroundings, small),
         "– of a step: encode the source, its own lookups": milliseconds(encoding, small[0], invariants[0]),
         "– of a step: place the other landmarks, in both clouds": 2 * place,
         "– of a step: consensus": milliseconds(agreeing, landmarks, others, jnp.ones(landmarks.shape[:2])),
-        "refine": milliseconds(jax.vmap(refined), *prepared, answer, small),
-        "– normals of both clouds": milliseconds(jax.vmap(normal), prepared),
-        "assess": milliseconds(jax.vmap(fit), *prepared, answer),
-        "register": milliseconds(jax.vmap(lambda a, b: register(a, b, model=model)), sources, targets),
+        "refine on samples": took(approach, *looked),
+        "refine on whole clouds": took(settle, refine, *ready, found.transform, found.width),
+        "EM-ICP, for the pairs that need it": took(expect, refine, *ready, settled),
+        "assess": took(assess, True, *ready, last.transform, last.converged, told),
+        "regions of both clouds": took(label, model, ready[0], start.seen, start.source)
+        + took(label, model, ready[1], start.still, start.target),
+        "register": 1e3 * median_seconds(whole, 7) / BATCH,
     }
     side = 2048
     square = jnp.ones((side, side))

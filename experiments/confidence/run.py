@@ -12,7 +12,6 @@ results.json, table.md and roc.png beside this file.
 """
 
 import argparse
-import functools
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -25,14 +24,18 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from urrt_jax import Search, load_model, model_card, pad_clouds, register
+from experiments.reproduce.run import AXISYMMETRIC
+from urrt_jax import ICP, Search, load_model, model_card, register_pairs
 from urrt_jax.assessment import ASSESSED, BIAS, fit
+from urrt_jax.clouds import Cloud
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import Trial, find_protocol, load_scan_pairs, pose_errors, roc_curve
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair, normalize_translation
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.host import PairOnHost
 from urrt_jax.model import Model
-from urrt_jax.reproduce.run import AXISYMMETRIC
+from urrt_jax.prepared import Sizes, prepare
+from urrt_jax.registration import make_options
+from urrt_jax.rigid import Rigid
+from urrt_jax.stages import rung, sizes_of
 
 HERE = Path(__file__).parent
 PROTOCOLS = ("incomplete_both", "outliers share=0.2", "independent_noise", "prnet_noise", "drift", "rpmnet")
@@ -40,7 +43,6 @@ SUBSET = "modelnet40_2048_normals_subset.npz"
 SCANS = "bunny_scans.npz"
 PAIRS, SEARCHED = 80, 40
 RIDGE = 3e-4
-BLOCK = 16_384
 
 
 class Answers(NamedTuple):
@@ -52,41 +54,27 @@ class Answers(NamedTuple):
     asymmetric: np.ndarray
 
 
-@functools.partial(jax.jit, static_argnames="search")
-def answer(
-    model: Model, sources: Array, source_masks: Array, targets: Array, target_masks: Array, search: Search | None
-) -> tuple:
-    def one(source: Array, source_mask: Array, target: Array, target_mask: Array) -> tuple:
-        result = register(source, target, source_mask=source_mask, target_mask=target_mask, model=model, search=search)
-        clouds = make_cloud(source, source_mask), make_cloud(target, target_mask)
-        moved_source, moved_target, frame = normalize_pair(*clouds)
-        pose = Rigid(result.rotation, normalize_translation(result.rotation, result.translation, frame))
-        return result.rotation, result.translation, fit(moved_source, moved_target, pose).evidence, result.confidence
-
-    return jax.vmap(one)(sources, source_masks, targets, target_masks)
+@jax.jit
+def evidence(sizes: Sizes, source: Cloud, target: Cloud, pose: Rigid) -> Array:
+    """What the confidence in a pose is made of, (4,), of clouds in their frame."""
+    return fit(prepare(sizes, source), prepare(sizes, target), pose).evidence
 
 
 def answers(
-    model: Model, trials: Sequence[Trial], asymmetric: np.ndarray, search: Search | None, reach: float, batch: int
+    model: Model, trials: Sequence[Trial], asymmetric: np.ndarray, search: Search | None, reach: float
 ) -> Answers:
-    size = max(len(cloud) for trial in trials for cloud in trial[:2])
-    size = size if size <= 4096 else -(-size // BLOCK) * BLOCK
-    found = []
-    for start in tqdm(range(0, len(trials), batch), leave=False):
-        some = list(trials[start : start + batch])
-        some += [some[0]] * (batch - len(some))
-        clouds = (
-            pad_clouds([trial.source for trial in some], size=size),
-            pad_clouds([t.target for t in some], size=size),
-        )
-        found.append(jax.tree.map(np.asarray, answer(model, *clouds[0], *clouds[1], search)))
-    rotation, translation, told_by, confidence = (
-        np.concatenate(each)[: len(trials)] for each in zip(*found, strict=True)
-    )
+    sources, targets = [trial.source for trial in trials], [trial.target for trial in trials]
+    found = register_pairs(sources, targets, model=model, search=search, progress=True)
+    sizes, told_by = sizes_of(make_options(model, ICP(), search)), []
+    for source, target, result in zip(sources, targets, found, strict=True):
+        pair = PairOnHost(source, target)
+        clouds = pair.padded(rung(pair.size))[:2]
+        told_by.append(evidence(sizes, *clouds, pair.frame.enter(Rigid(result.rotation, result.translation))))
     truth = [np.stack([getattr(trial, name) for trial in trials]) for name in ("rotation", "translation")]
-    errors = pose_errors(rotation, translation, *truth)
+    errors = pose_errors(found.rotation, found.translation, *truth)
     scales = np.array([trial.scale for trial in trials])
-    return Answers((errors["angle"] < 5) & (errors["distance"] < reach * scales), told_by, confidence, asymmetric)
+    right = (errors["angle"] < 5) & (errors["distance"] < reach * scales)
+    return Answers(right, np.stack(told_by), found.confidence, asymmetric)
 
 
 def trials_of(protocol: str, data: str, split: Literal["train", "test"], count: int) -> tuple[list[Trial], np.ndarray]:
@@ -121,9 +109,9 @@ def measure(model: Model, data: str, split: Literal["train", "test"]) -> dict[st
         trials, asymmetric = trials_of(protocol, data, split, PAIRS)
         anyhow, every = turned(trials, 1), PAIRS // SEARCHED
         parts = [
-            answers(model, trials, asymmetric, None, 0.1, 40),
-            answers(model, anyhow, asymmetric, None, 0.1, 40),
-            answers(model, anyhow[::every], asymmetric[::every], Search(), 0.1, 8),
+            answers(model, trials, asymmetric, None, 0.1),
+            answers(model, anyhow, asymmetric, None, 0.1),
+            answers(model, anyhow[::every], asymmetric[::every], Search(), 0.1),
         ]
         found[protocol] = together(parts)
     return found
@@ -221,7 +209,7 @@ if __name__ == "__main__":
     test = measure(model, flags.data, "test")
     scans, _ = load_scan_pairs(Path(flags.data) / SCANS)
     seen = np.ones(len(scans), bool)
-    test["real scans"] = together([answers(model, scans, seen, search, 0.05, 1) for search in (None, Search())])
+    test["real scans"] = together([answers(model, scans, seen, search, 0.05) for search in (None, Search())])
     test["all"] = together(test.values())
     test["all but axisymmetric shapes"] = Answers(*(values[test["all"].asymmetric] for values in test["all"]))
     results = {

@@ -17,15 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from urrt_jax import load_model, model_card
+from urrt_jax import load_model, model_card, rigid
+from urrt_jax.clouds import make_cloud, subsample
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import find_protocol
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair, normalize_translation, subsample
-from urrt_jax.geometry.neighbors import nearest
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.frames import normalize_pair
 from urrt_jax.model import Model
 from urrt_jax.model.network import encode, estimate_subsampled, point_regions
+from urrt_jax.neighbors import nearest
+from urrt_jax.rigid import Rigid
 from urrt_jax.viewer import region_colors
 
 HERE = Path(__file__).parent
@@ -57,7 +57,7 @@ def cut(model: Model, sources: Array, targets: Array, rotations: Array, translat
 
     def one(source_points: Array, target_points: Array, rotation: Array, translation: Array) -> Cut:
         source, target, frame = normalize_pair(make_cloud(source_points), make_cloud(target_points))
-        truth = Rigid(rotation, normalize_translation(rotation, translation, frame))
+        truth = frame.enter(Rigid(rotation, translation))
         answer = estimate_subsampled(model, source, target)
         return Cut(
             source=point_regions(model, source.points, encode(model, subsample(source, model.config.points))),

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from urrt_jax.evaluation import euler_angles, pose_errors, recall_curve, roc_curve, rotation_degrees, summarize
 from urrt_jax.evaluation.metrics import clean_chamfer, true_overlap
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.rigid import Rigid
 
 
 def turn(degrees: float, axis: str = "z") -> np.ndarray:

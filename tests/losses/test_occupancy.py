@@ -1,14 +1,19 @@
 """The occupancy loss by hand, and what a shell calls inside."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax.clouds import make_cloud
 from urrt_jax.losses import occupancy_loss, shell_samples
 
+# One number of queries, so that the sampler is compiled once.
+_COUNT = 2000
+_samples = jax.jit(functools.partial(shell_samples, count=_COUNT))
 _LOGITS = np.array([0.0, 2.0, -1.0], np.float32)
 _INSIDE = np.array([True, True, False])
 
@@ -38,12 +43,12 @@ def test_occupancy_loss_and_gradient_are_finite_for_extreme_logits():
 @pytest.fixture(scope="module", params=[0.5, 1.0, 2.0])
 def samples(request, cloud):
     thickness = request.param
-    queries, inside = shell_samples(jax.random.key(0), make_cloud(cloud), 2000, thickness=thickness)
+    queries, inside = _samples(jax.random.key(0), make_cloud(cloud), thickness=thickness)
     return thickness, np.asarray(queries), np.asarray(inside)
 
 
 def test_shell_samples_give_both_answers_often(cloud):
-    _, inside = shell_samples(jax.random.key(0), make_cloud(cloud), 2000)
+    _, inside = _samples(jax.random.key(0), make_cloud(cloud), thickness=1.0)
     assert 0.1 < float(inside.mean()) < 0.9
 
 
@@ -62,7 +67,7 @@ def test_shell_samples_are_unchanged_by_the_value_of_padding(cloud):
 
     def draw(value):
         padded = np.where(mask[:, None], cloud, np.float32(value))
-        return shell_samples(jax.random.key(1), make_cloud(padded, mask), 200)
+        return _samples(jax.random.key(1), make_cloud(padded, mask), thickness=1.0)
 
     for one, other in zip(draw(0.0), draw(77.0), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -71,22 +76,23 @@ def test_shell_samples_are_unchanged_by_the_value_of_padding(cloud):
 def test_shell_samples_never_lie_about_padding():
     """Padding is stored at the origin, so a cloud far from it shows whether padding was drawn from."""
     rng = np.random.default_rng(0)
-    points = (0.1 * rng.normal(size=(100, 3)) + [5, 0, 0]).astype(np.float32)
-    queries, _ = shell_samples(jax.random.key(2), make_cloud(points, np.arange(100) < 40), 400)
-    assert float(jnp.min(queries[:200, 0])) > 3
+    points = (0.1 * rng.normal(size=(200, 3)) + [5, 0, 0]).astype(np.float32)
+    queries, _ = _samples(jax.random.key(2), make_cloud(points, np.arange(200) < 40), thickness=1.0)
+    assert float(jnp.min(queries[: _COUNT // 2, 0])) > 3
 
 
 def test_shell_samples_of_another_key_differ(cloud):
-    first, second = (shell_samples(jax.random.key(seed), make_cloud(cloud), 50)[0] for seed in (0, 1))
+    first, second = (_samples(jax.random.key(seed), make_cloud(cloud), thickness=1.0)[0] for seed in (0, 1))
     assert not np.any(np.all(np.asarray(first) == np.asarray(second), axis=1))
 
 
 def test_shell_samples_have_no_derivative_through_the_labels(cloud):
-    gradient = jax.grad(lambda p: jnp.mean(shell_samples(jax.random.key(0), make_cloud(p), 50)[0]))(jnp.asarray(cloud))
+    total = jax.jit(jax.grad(lambda p: jnp.mean(_samples(jax.random.key(0), make_cloud(p), thickness=1.0)[0])))
+    gradient = total(jnp.asarray(cloud))
     assert bool(jnp.all(jnp.isfinite(gradient)))
 
 
 def test_shell_samples_of_an_empty_cloud_are_finite(cloud):
-    queries, inside = shell_samples(jax.random.key(0), make_cloud(cloud, np.zeros(200, bool)), 20)
+    queries, inside = _samples(jax.random.key(0), make_cloud(cloud, np.zeros(200, bool)), thickness=1.0)
     assert bool(jnp.all(jnp.isfinite(queries)))
     assert not bool(jnp.any(inside))

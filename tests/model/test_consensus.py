@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from urrt_jax.geometry import rigid
+from urrt_jax import rigid
 from urrt_jax.model.consensus import align_landmarks, even_seeds, hypotheses
 
+_HASTY = {"xla_backend_optimization_level": 0}  # compiling takes far longer than running
 
-@functools.partial(jax.jit, static_argnames=("rounds", "hypotheses"))
+
+@functools.partial(jax.jit, static_argnames=("rounds", "hypotheses"), compiler_options=_HASTY)
 def _align(source, target, weights, *, rounds, hypotheses=0):
     seeds = even_seeds([len(weights)], hypotheses)
     return align_landmarks(source, target, weights, rounds=rounds, seeds=seeds)
@@ -30,14 +32,14 @@ def _weights() -> jnp.ndarray:
     return jnp.asarray(np.random.default_rng(9).uniform(0.2, 1, 20), jnp.float32)
 
 
-@pytest.mark.parametrize(("rounds", "hypotheses"), [(0, 0), (3, 0), (3, 5), (3, 64)])
+@pytest.mark.parametrize(("rounds", "hypotheses"), [(0, 0), (3, 0), (3, 8)])
 def test_matching_landmarks_give_their_motion(pose, rounds, hypotheses):
     source = _landmarks()
     found = _align(source, source @ pose[0].T + pose[1], _weights(), rounds=rounds, hypotheses=hypotheses)
     _close(found, rigid.Rigid(pose[0], pose[1]), atol=1e-3)
 
 
-@pytest.mark.parametrize(("rounds", "hypotheses"), [(0, 0), (3, 0), (3, 5), (3, 64)])
+@pytest.mark.parametrize(("rounds", "hypotheses"), [(0, 0), (3, 0), (3, 8)])
 def test_landmarks_without_weight_do_not_count(pose, rounds, hypotheses):
     source, weights = _landmarks(), _weights().at[3].set(0.0)
     target = source @ pose[0].T + pose[1]
@@ -159,16 +161,24 @@ def test_derivatives_are_those_of_the_rounds(pose):
     source, target, weights = _misplaced(pose, 5, 0.3)
 
     def height(shift, hypotheses):
-        return _align(source, target + shift * source**2, weights, rounds=40, hypotheses=hypotheses)[1][2]
+        seeds = even_seeds([len(weights)], hypotheses)
+        return align_landmarks(source, target + shift * source**2, weights, rounds=40, seeds=seeds)[1][2]
 
-    slope = jax.grad(height)(0.0, 64)
+    slope, plain = (
+        float(jax.jit(jax.grad(height), static_argnums=1, compiler_options=_HASTY)(0.0, k)) for k in (64, 0)
+    )
     assert np.isfinite(slope)
-    assert slope == pytest.approx(float(jax.grad(height)(0.0, 0)), rel=1e-2)
+    assert slope == pytest.approx(plain, rel=1e-2)
 
 
 def test_derivatives_at_coinciding_landmarks_are_finite():
     same = jnp.zeros((20, 3)).at[0].set(1.0)
-    slopes = jax.grad(lambda places: jnp.sum(_align(places, same, _weights(), rounds=3, hypotheses=8)[1]))(same)
+    seeds = even_seeds([20], 8)
+
+    def total(places):
+        return jnp.sum(align_landmarks(places, same, _weights(), rounds=3, seeds=seeds)[1])
+
+    slopes = jax.jit(jax.grad(total), compiler_options=_HASTY)(same)
     assert np.all(np.isfinite(slopes))
 
 
@@ -190,7 +200,7 @@ def test_no_seeds(groups):
 
 
 _every = np.arange(20)
-_say = jax.jit(lambda source, target, weights: hypotheses(source, target, weights, _every))
+_say = jax.jit(lambda source, target, weights: hypotheses(source, target, weights, _every), compiler_options=_HASTY)
 
 
 def test_every_hypothesis_of_matching_landmarks_is_their_motion(pose):
@@ -227,5 +237,5 @@ def test_hypotheses_without_weight_are_rigid(weights):
 
 
 def test_without_seeds_there_are_no_hypotheses():
-    found = hypotheses(_landmarks(1), _landmarks(2), _weights(), np.zeros(0, int))
+    found = jax.eval_shape(hypotheses, _landmarks(1), _landmarks(2), _weights(), np.zeros(0, int))
     assert found.rotation.shape == (0, 3, 3)

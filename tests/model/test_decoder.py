@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair
+from urrt_jax import rigid
+from urrt_jax.clouds import make_cloud
+from urrt_jax.frames import normalize_pair
 from urrt_jax.model import estimate, init_model
 from urrt_jax.model.decoder import fusion_weights
 from urrt_jax.model.landmarks import (
@@ -23,7 +24,8 @@ from urrt_jax.model.landmarks import (
 )
 from urrt_jax.model.pose import fuse_poses
 
-_estimate = jax.jit(estimate)
+_HASTY = {"xla_backend_optimization_level": 0}  # compiling takes far longer than running
+_estimate = jax.jit(estimate, compiler_options=_HASTY)
 
 
 def _close(first, second, atol=1e-5):

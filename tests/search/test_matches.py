@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax.clouds import make_cloud
 from urrt_jax.search.matches import Matches, match_features, poses_from_matches
 
 _COUNT = 100

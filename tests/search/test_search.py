@@ -1,10 +1,9 @@
 """Search: poses of any angle at partial overlap, what the answer is invariant to, and what it does when there is none.
 
-Most tests share one compiled program: clouds are padded to one size.
+Almost all tests run the same compiled stages: clouds are padded to the first rung, and one configuration fixes shapes.
 """
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +11,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from urrt_jax import load_model, register
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud, normalize_pair, subsample
+from urrt_jax import load_model, register, rigid, stages
+from urrt_jax.clouds import make_cloud
+from urrt_jax.frames import normalize_pair
 from urrt_jax.model.network import estimate, propose
-from urrt_jax.search import Found, Search, search
+from urrt_jax.prepared import Sizes
+from urrt_jax.refine import ICP
+from urrt_jax.search import Found, Search
+from urrt_jax.search.search import DENSE, search_thoroughly
 
 _SMALL = Search(points=128, matches=16, landmarks=0, tried=16)
-_SIZE = 220
+_SIZE = 256
+_SIZES = Sizes(sample=512, queries=ICP().points, normal_radius=ICP().normal_radius)
 _AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
 _SHIFT = np.array([0.4, -0.2, 0.7])
 
@@ -41,23 +44,41 @@ def _pad(points: np.ndarray, rows: np.ndarray | None = None):
     return padded, mask
 
 
-def _search(model, config, source, target, plain=None) -> Found:
-    pair = normalize_pair(make_cloud(*source), make_cloud(*target))
-    return search(model, pair[0], pair[1], config, rigid.identity() if plain is None else plain)
+@jax.jit
+def _normalized(source, target):
+    return normalize_pair(make_cloud(*source), make_cloud(*target))[:2]
 
 
-_jitted = jax.jit(_search, static_argnums=1)
+def _samples(source, target):
+    """Samples of both clouds (points and mask) in their frame."""
+    return [stages.prepare(_SIZES, cloud).samples for cloud in _normalized(source, target)]
+
+
+def _plain(transform: rigid.Rigid | None = None) -> Found:
+    """The pose that a search begins with, by default the identity."""
+    return Found(transform or rigid.identity(), jnp.zeros(()), jnp.zeros(()), jnp.array(True))
 
 
 @pytest.fixture(scope="module")
 def find(small_model):
-    """A function of two clouds (and a configuration), padded here: what the search finds."""
+    """A function of two clouds (and a configuration, and a pose at hand), padded here: what the search finds."""
 
-    def find_small(source, target, config=_SMALL) -> Found:
+    def find_small(source, target, config=_SMALL, plain=None) -> Found:
         source, target = (cloud if isinstance(cloud, tuple) else _pad(cloud) for cloud in (source, target))
-        return _jitted(small_model, config, source, target)
+        return stages.search_thoroughly((config, small_model), *_samples(source, target), _plain(plain))
 
     return find_small
+
+
+@pytest.fixture(scope="module")
+def look():
+    """A function of two clouds (and options of the search): what a quick look finds."""
+
+    def look_quickly(source, target, **options) -> Found:
+        config = dataclasses.replace(_SMALL, **options)
+        return stages.search_quickly(config, *_samples(_pad(source), _pad(target)), _plain())
+
+    return look_quickly
 
 
 @pytest.fixture(scope="module")
@@ -115,9 +136,9 @@ def test_swapping_the_clouds_keeps_the_score(find, partial, found):
     assert float(back.score) == pytest.approx(float(found.score), abs=0.03)
 
 
-def test_swapping_the_clouds_keeps_the_reach(find, partial, found):
+def test_swapping_the_clouds_keeps_the_width(find, partial, found):
     back = find(*reversed(partial(120)))
-    assert float(back.reach) == pytest.approx(float(found.reach), rel=1e-5)
+    assert float(back.width) == pytest.approx(float(found.width), rel=1e-5)
 
 
 def test_turning_the_target_turns_the_answer(find, partial, found):
@@ -149,9 +170,9 @@ def test_place_of_padding_does_not_matter(find, partial, found):
     _same(find(*padded), found, atol=1e-3)
 
 
-def test_padding_does_not_matter(small_model, partial, found):
+def test_padding_does_not_matter(find, partial, found):
     bare = ((cloud, np.ones(len(cloud), bool)) for cloud in partial(120))
-    _same(_jitted(small_model, _SMALL, *bare), found, atol=1e-3)
+    _same(find(*bare), found, atol=1e-3)
 
 
 def test_non_finite_padding_does_not_matter(find, partial, found):
@@ -161,8 +182,8 @@ def test_non_finite_padding_does_not_matter(find, partial, found):
 
 def test_vmap_agrees_with_a_loop(small_model, find, partial):
     pairs = [[_pad(cloud) for cloud in partial(degrees)] for degrees in (60, 180)]
-    source, target = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
-    together = jax.jit(jax.vmap(functools.partial(_search, small_model, _SMALL)))(source, target)
+    samples = jax.tree.map(lambda *leaves: np.stack(leaves), *(_samples(*pair) for pair in pairs))
+    together = jax.jit(jax.vmap(lambda s, t: search_thoroughly((_SMALL, small_model), s, t, _plain())))(*samples)
     for i, pair in enumerate(pairs):
         _same(jax.tree.map(lambda leaf, i=i: leaf[i], together), find(*pair), atol=1e-3)
 
@@ -173,19 +194,17 @@ def test_max_angle_excludes_a_half_turn(find, cloud):
     assert _degrees(find(cloud, target, bound).transform.rotation, np.eye(3)) <= 90.01
 
 
-def test_the_given_estimate_is_kept_where_every_hypothesis_turns_too_far(small_model, cloud):
+def test_the_given_estimate_is_kept_where_every_hypothesis_turns_too_far(find, cloud):
     """With a score of 0: it was not found, but was there."""
     plain = rigid.Rigid(jnp.asarray(_turn(120), jnp.float32), jnp.array([0.1, 0.2, 0.3]))
-    bound = dataclasses.replace(_SMALL, matches=8, tried=8, max_angle=1e-3)
-    found = _jitted(small_model, bound, _pad(cloud), _pad((cloud @ _turn(150).T).astype(np.float32)), plain)
+    bound = dataclasses.replace(_SMALL, max_angle=1e-3)
+    found = find(cloud, (cloud @ _turn(150).T).astype(np.float32), bound, plain)
     assert float(found.score) == 0
     jax.tree.map(lambda leaf, other: np.testing.assert_allclose(leaf, other, atol=1e-6), found.transform, plain)
 
 
-@pytest.mark.parametrize("source", [{"rotations": 24}, {"landmarks": 32}], ids=lambda source: next(iter(source)))
-def test_without_matches_the_network_alone_gives_a_rigid_answer(find, partial, source):
-    answer = find(*partial(60), dataclasses.replace(_SMALL, points=64, matches=0, **source))
-    _assert_rigid(answer)
+def test_without_matches_the_network_alone_gives_a_rigid_answer(find, partial):
+    _assert_rigid(find(*partial(60), dataclasses.replace(_SMALL, points=64, matches=0, landmarks=32)))
 
 
 def test_landmarks_speak_for_a_pose_that_the_estimate_misses(make_cloud_points):
@@ -237,65 +256,43 @@ def test_a_stray_point_does_not_matter(find, partial):
 
 
 @pytest.mark.parametrize(("preference", "expected"), [(0.0, 70), (0.5, 20)])
-def test_of_poses_that_fit_nearly_alike_the_one_that_turns_less_is_preferred(small_model, preference, expected):
+def test_of_poses_that_fit_nearly_alike_the_one_that_turns_less_is_preferred(find, preference, expected):
     """A cloud of four-fold symmetry but for a few points, turned by 70 degrees: a turn by -20 degrees nearly fits."""
     random = np.random.default_rng(0)
-    quarter = random.uniform([0.3, 0.1, -1], [1.0, 0.3, 1], (50, 3))
+    quarter = random.uniform([0.3, 0.1, -1], [1.0, 0.3, 1], (30, 3))  # 126 points in all: the subsample has them all
     turns = Rotation.from_rotvec(np.outer(np.arange(4) * np.pi / 2, [0, 0, 1])).as_matrix()
     few = random.uniform([0.3, 0.5, -1], [0.5, 0.7, 1], (6, 3))
     source = np.concatenate([*(quarter @ turn.T for turn in turns), few]).astype(np.float32)
     turn, other = (Rotation.from_rotvec([0, 0, np.deg2rad(angle)]).as_matrix() for angle in (70, -20))
     plain = rigid.Rigid(jnp.asarray(other, jnp.float32), jnp.zeros(3))
-    config = dataclasses.replace(_SMALL, points=_SIZE, preference=preference)  # all points, which fit alike
-    found = _jitted(small_model, config, _pad(source), _pad((source @ turn.T).astype(np.float32)), plain)
+    config = dataclasses.replace(_SMALL, preference=preference)
+    found = find(source, (source @ turn.T).astype(np.float32), config, plain)
     assert _degrees(found.transform.rotation, np.eye(3)) == pytest.approx(expected, abs=4)
     assert float(found.score) > 0.9  # what a turn costs is not taken from it
 
 
-@pytest.fixture(scope="module")
-def scans(make_cloud_points):
-    """Two dense clouds of other points, partial, the second turned by 120 degrees."""
-    source, target = (make_cloud_points(seed, 25) for seed in (1, 2))
-    source, target = source[source[:, 0] > -0.5], target[target[:, 1] > -0.4]
-    return source[:4100], (target @ _turn(120).T + _SHIFT).astype(np.float32)[:4100]
+@pytest.mark.parametrize("degrees", [0, 60, 120, 180])
+def test_a_quick_look_finds_any_turn_at_partial_overlap(look, partial, degrees):
+    assert _degrees(look(*partial(degrees)).transform.rotation, _turn(degrees)) < 5
 
 
-@pytest.fixture(scope="module")
-def look(small_model, scans):
-    """A function of options of the search: what it finds of the dense clouds."""
-    return lambda **options: _jitted(
-        small_model, dataclasses.replace(_SMALL, **options), *((cloud, np.ones(len(cloud), bool)) for cloud in scans)
-    )
+@pytest.mark.parametrize(("sure", "pending"), [(1e-6, False), (1.5, True)])
+def test_a_quick_look_calls_for_the_thorough_search_where_it_is_not_sure(look, partial, sure, pending):
+    assert bool(look(*partial(120), sure=sure).pending) == pending
 
 
-def test_a_quick_look_finds_the_pose_of_dense_clouds(look):
-    assert _degrees(look(quick=256, sure=1e-6).transform.rotation, _turn(120)) < 5
+def test_a_quick_look_at_another_shape_is_not_sure(look, cloud):
+    box = np.random.default_rng(0).uniform(-1, 1, cloud.shape).astype(np.float32)
+    assert bool(look(cloud, box).pending)
 
 
-def test_a_quick_look_that_is_not_sure_gives_way_to_the_whole_search(look):
-    unsure, whole = look(quick=256, sure=1.5), look(quick=0)
-    _same(unsure, whole, atol=1e-6)
-    assert float(look(quick=256, sure=1e-6).reach) != pytest.approx(float(whole.reach), rel=1e-3)
-
-
-def test_a_quick_look_takes_the_samples_that_are_there(small_model, scans):
-    config = dataclasses.replace(_SMALL, quick=256, sure=1e-6)
-
-    @jax.jit
-    def three_ways(source, target):
-        pair = normalize_pair(make_cloud(source), make_cloud(target))[:2]
-        small = tuple(subsample(cloud, 256) for cloud in pair)
-        plain = rigid.identity()
-        larger = tuple(cloud._replace(points=2 * cloud.points) for cloud in small)
-        return [search(small_model, *pair, config, plain, small=each) for each in (None, small, larger)]
-
-    own, given, larger = three_ways(*scans)
-    _same(own, given)
-    assert float(larger.reach) == pytest.approx(2 * float(own.reach), rel=1e-5)  # otherwise they might be ignored.
-
-
-def test_sparse_clouds_are_not_looked_at_quickly(find, partial):
-    _same(find(*partial(120), dataclasses.replace(_SMALL, quick=64, sure=1e-6)), find(*partial(120)), atol=1e-6)
+@pytest.mark.parametrize(
+    ("counts", "quick"), [((DENSE, DENSE), True), ((DENSE - 1, 10**6), False), ((10**6, DENSE - 1), False)]
+)
+def test_only_dense_clouds_are_looked_at_quickly(partial, counts, quick):
+    samples = _samples(*(_pad(cloud) for cloud in partial(120)))
+    plan = stages.approach((ICP(), True), *samples, tuple(map(np.int32, counts)), rigid.identity())
+    assert bool(plan.quick) == quick
 
 
 @pytest.mark.parametrize("preference", [-0.1, 1.5, float("nan"), "much"])
@@ -310,20 +307,14 @@ def test_too_few_are_refused_by_name(name):
         Search(**{name: 0})
 
 
-@pytest.mark.parametrize("name", ["matches", "landmarks", "quick"])
+@pytest.mark.parametrize("name", ["matches", "landmarks"])
 def test_negative_numbers_are_refused_by_name(name):
     with pytest.raises(ValueError, match=f"^{name}: expected at least 0, got -1"):
         Search(**{name: -1})
 
 
-@pytest.mark.parametrize("rotations", [-1, 2, 23, 48])
-def test_rotations_without_a_cover_are_refused(rotations):
-    with pytest.raises(ValueError, match=f"^rotations: expected 0, 1, 24 or 60, got {rotations}"):
-        Search(rotations=rotations)
-
-
 def test_a_search_without_hypotheses_is_refused():
-    with pytest.raises(ValueError, match=r"^matches, landmarks and rotations: "):
+    with pytest.raises(ValueError, match=r"^matches and landmarks: "):
         Search(matches=0, landmarks=0)
 
 
@@ -359,14 +350,18 @@ def test_register_with_search_converges(searched):
     assert bool(searched.converged)
 
 
-def test_register_without_search_does_not_recover_a_turn_by_150_degrees(small_model, cloud, half_turned):
+@pytest.fixture(scope="module")
+def unsearched(small_model, cloud, half_turned):
+    return register(cloud, half_turned, model=small_model, search=None)
+
+
+def test_register_without_search_does_not_recover_a_turn_by_150_degrees(unsearched):
     """Otherwise the tests of search here would test nothing."""
-    assert _degrees(register(cloud, half_turned, model=small_model).rotation, _turn(150)) > 20
+    assert _degrees(unsearched.rotation, _turn(150)) > 20
 
 
-def test_register_with_search_still_reports_the_network_s_estimate(small_model, cloud, half_turned, searched):
-    plain = register(cloud, half_turned, model=small_model)
-    np.testing.assert_allclose(searched.coarse.rotation, plain.coarse.rotation, atol=1e-5)
+def test_register_with_search_still_reports_the_network_s_estimate(unsearched, searched):
+    np.testing.assert_allclose(searched.coarse.rotation, unsearched.coarse.rotation, atol=1e-5)
 
 
 def test_register_without_refinement_returns_the_search_s_pose(small_model, cloud, half_turned):
@@ -376,7 +371,7 @@ def test_register_without_refinement_returns_the_search_s_pose(small_model, clou
 
 def test_register_with_automatic_search_leaves_a_converged_result_alone(small_model, cloud, pose):
     target = (cloud @ pose[0].T + pose[1]).astype(np.float32)
-    plain = register(cloud, target, model=small_model)
+    plain = register(cloud, target, model=small_model, search=None)
     found = register(cloud, target, model=small_model, search="auto")
     np.testing.assert_array_equal(found.matrix, plain.matrix)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud
+from urrt_jax import rigid
+from urrt_jax.clouds import make_cloud
 from urrt_jax.training.pairs import (
     PairConfig,
     add_noise,

@@ -1,30 +1,27 @@
-"""The command ``urrt``: register two files, a demonstration, training, evaluation, the paper's tables.
+"""The command ``urrt``: register two files, a demonstration, training, evaluation.
 
 One module a subcommand: a frozen dataclass whose fields are its flags and whose ``run`` does the work. JAX is imported
 inside ``run``, so that ``--help`` answers at once.
 """
 
-import hashlib
 import os
-import platform
 import sys
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import tyro
 
 from urrt_jax.cli.demo import Demo
 from urrt_jax.cli.evaluate import Evaluate
 from urrt_jax.cli.register import Register
-from urrt_jax.cli.reproduce import Reproduce
 from urrt_jax.cli.train import Train
 
-_COMMANDS = {"register": Register, "demo": Demo, "train": Train, "evaluate": Evaluate, "reproduce": Reproduce}
+_COMMANDS = {"register": Register, "demo": Demo, "train": Train, "evaluate": Evaluate}
 _DESCRIPTION = """Rigid registration of 3D point clouds: the rotation R and translation t with target = R @ source + t.
 
 Environment variables:
 
-URRT_DATA      the data for train, evaluate and reproduce, where --data is not given
+URRT_DATA      the data for train and evaluate, where --data is not given
 
 URRT_NO_CACHE  if set, compiled programs are not kept in the user's cache folder
 
@@ -41,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _COMMANDS, prog="urrt", description=_DESCRIPTION, args=arguments, config=_STYLE
     )
     try:
-        _keep_compiled_programs()
+        _keep_compiled_programs(command)
         return command.run()
     except KeyboardInterrupt:
         return 130
@@ -52,33 +49,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _keep_compiled_programs() -> None:
-    """Turns on JAX's persistent compilation cache, in the user's cache folder if that can be written."""
+def _keep_compiled_programs(command: Any) -> None:
+    """From now on compiled programs are kept in the user's cache folder, if that can be written."""
     if os.environ.get("URRT_NO_CACHE"):
         return
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "urrt_jax" / _processor()
+    # Before JAX is imported: XLA's CPU loader logs a screenful of errors for every program, because it takes two tuning
+    # hints for instructions that the processor lacks; programs for other processors have other names.
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    from urrt_jax.program_cache import processor, use_compilation_cache
+
+    folder = use_compilation_cache()
+    if folder is None or not isinstance(command, Train):
+        return
+    # The steps of training are no programs of ours, but jitted functions, which JAX itself can keep.
+    from importlib.metadata import version
+
+    import jax
+
+    folder = folder.parent / "jax" / f"{version('jaxlib')}-{processor()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return
-    if not os.access(folder, os.W_OK):
-        return
-    # XLA's CPU loader logs a screenful of errors at every hit, because it takes two tuning hints for instructions that
-    # the processor lacks; real mismatches are excluded by the folder's name.
-    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
-    import jax
-
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def _processor() -> str:
-    """A name for this kind of processor: a home folder may be shared by several, and programs are compiled for one."""
-    described = platform.machine() + platform.processor()
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        described += next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    except OSError:  # not Linux
-        pass
-    return hashlib.sha256(described.encode()).hexdigest()[:12]

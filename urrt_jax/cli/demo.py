@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,13 +34,16 @@ class Demo:
         """Registers, prints the errors and writes the picture."""
         import numpy as np
 
-        from urrt_jax import load_model, register
+        from urrt_jax import ICP, load_model, register
+        from urrt_jax.cli.compiling import compile_for
         from urrt_jax.cli.printing import as_table
         from urrt_jax.evaluation.metrics import rotation_degrees
         from urrt_jax.viewer import plot_registration
 
         source, target, rotation, translation = demo_pair(self.seed, noise=self.noise, keep=self.keep)
-        result = register(source, target, model=load_model(self.model))
+        options: dict[str, Any] = {"model": load_model(self.model), "refine": ICP(), "search": "auto"}
+        compile_for(max(len(source), len(target)), **options)
+        result = register(source, target, **options)
         turned = float(rotation_degrees(rotation, np.eye(3)))
         error = float(rotation_degrees(result.rotation, rotation))
         offset = np.linalg.norm(np.asarray(result.translation) - translation)

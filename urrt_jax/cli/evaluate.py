@@ -23,9 +23,10 @@ class Evaluate:
             incomplete_both, drift, drift_target, outliers, independent, independent_noise, scans. Options follow the
             name, as in 'outliers share=0.2'.
         methods: network, register and search are ours: alone, refined, and after a search within 90° (search_all: among
-            all rotations); a model of its own may follow, as in network:modelnet40-paper. identity and principal_axes
-            need nothing; icp, icp_identity, icp_plane, gicp, fgr, fgr_icp, ransac, ransac_icp, kiss, and on scans
-            scan_icp, scan_fgr, scan_ransac, scan_kiss need 'urrt-jax[peers]'; goicp says how to install it.
+            all rotations; auto: where it is needed); a model of its own may follow, as in network:modelnet40-paper.
+            identity and principal_axes need nothing; icp, icp_identity, icp_plane, gicp, fgr, fgr_icp, ransac,
+            ransac_icp, kiss, and on scans scan_icp, scan_fgr, scan_ransac, scan_kiss need 'urrt-jax[peers]'; goicp says
+            how to install it.
         model: Ours: name of a packaged model, or a file written by 'urrt train'.
         limit: At most so many items, evenly spread.
         points: Points of each shape.

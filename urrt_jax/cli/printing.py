@@ -7,29 +7,39 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from urrt_jax.evaluation.metrics import rotation_degrees
-from urrt_jax.registration import Registration
+from urrt_jax.result import Registration
 
 
 def as_dict(result: Registration) -> dict[str, Any]:
-    """What ``--json`` prints."""
+    """The result as lists and numbers for JSON, as `--json` prints it; None for a number that is not finite."""
     matrix = np.asarray(result.matrix, np.float64)
     return {
-        "matrix": matrix.tolist(),
-        "rotation": matrix[:3, :3].tolist(),
-        "translation": matrix[:3, 3].tolist(),
-        "fitness": float(result.fitness),
-        "rmse": float(result.rmse),
-        "overlap": np.asarray(result.overlap, np.float64).tolist(),
-        "confidence": float(result.confidence),
+        "matrix": _as_json(matrix),
+        "rotation": _as_json(matrix[:3, :3]),
+        "translation": _as_json(matrix[:3, 3]),
+        "fitness": _as_json(result.fitness),
+        "rmse": _as_json(result.rmse),
+        "overlap": _as_json(result.overlap),
+        "confidence": _as_json(result.confidence),
         "converged": bool(result.converged),
-        "information": np.asarray(result.information, np.float64).tolist(),
+        "reason": result.reason,
+        "information": _as_json(result.information),
     }
 
 
+def _as_json(numbers: ArrayLike) -> Any:
+    """The numbers as a float or nested lists of floats, with None for NaN and infinity, which JSON does not have."""
+    numbers = np.asarray(numbers, np.float64)
+    values = numbers.astype(object)
+    values[~np.isfinite(numbers)] = None
+    return values.tolist()
+
+
 def as_table(result: Registration) -> str:
-    """The same for people."""
+    """The result as lines of text, as `urrt register` prints it."""
     rotation, translation = np.asarray(result.rotation), np.asarray(result.translation)
     heading = f"R, turns by {float(rotation_degrees(rotation, np.eye(3))):.2f}°"
     lines = [f"{'':13}{heading:<36}t"]
@@ -42,7 +52,7 @@ def as_table(result: Registration) -> str:
         f"rmse         {float(result.rmse):<8.4g} of those points",
         "overlap      {:.0%} of the source, {:.0%} of the target".format(*np.asarray(result.overlap).tolist()),
         f"confidence   {float(result.confidence):.3f}",
-        "converged    yes" if result.converged else "converged    NO       do not rely on this transform",
+        "converged    yes" if result.converged else f"converged    NO       {result.reason}",
     ]
     return "\n".join(lines)
 

@@ -17,10 +17,10 @@ from jax import Array
 from tqdm import tqdm
 
 from urrt_jax.atomic import write_atomically
-from urrt_jax.evaluation.methods import Method, Poses, find_method
+from urrt_jax.evaluation.methods import Method, Ours, Poses, find_method
 from urrt_jax.evaluation.metrics import clean_chamfer, pose_errors, summarize, true_overlap
 from urrt_jax.evaluation.protocols import Trial, find_protocol
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.rigid import Rigid
 
 _SAVE_EVERY = 20.0  # seconds
 _OVERLAP_REACH = 0.1  # scales
@@ -135,7 +135,7 @@ def evaluate(
 ) -> Evaluation:
     """The evaluation of a method over the items of a protocol.
 
-    Our methods run in jitted batches, others pair by pair. An item on which the method raises, or gives values that are
+    Our methods run in batches, others pair by pair. An item on which the method raises, or gives values that are
     not finite, is scored as the identity and listed in ``failures``. With ``save`` the values are kept in a ``.npz``
     all along, also when the run is interrupted, and the same call continues after the last item there.
 
@@ -177,6 +177,8 @@ def evaluate(
         parts, kept = [before], len(before)
     done = kept
 
+    if batch is not None and isinstance(method, Ours):
+        method = dataclasses.replace(method, batch=batch)
     size = min(method.batch if batch is None else batch, len(chosen))
     saved = time.monotonic()
     try:
@@ -226,34 +228,31 @@ def _evaluate_part(
     method: Method, protocol: str, identity: dict, part: np.ndarray, size: int, make: Any, data: Any
 ) -> Evaluation:
     trials = [make(data, int(item)) for item in part]
-    # The last batch is filled up with its own first item, so that one compiled program serves all.
-    filled = trials + [trials[0]] * (size - len(trials))
     start = time.perf_counter()
-    poses, failures = _align(method, filled, [int(item) for item in part])
+    poses, failures = _align(method, trials, [int(item) for item in part])
     seconds = (time.perf_counter() - start) / len(part)
-    chamfer, overlap = _compare(filled, poses)
-    count = len(part)
+    chamfer, overlap = _compare(trials, poses, size)
     return Evaluation(
         method=method.title,
         protocol=protocol,
         items=part,
-        rotations=poses.rotation[:count],
-        translations=poses.translation[:count],
+        rotations=poses.rotation,
+        translations=poses.translation,
         true_rotations=np.stack([trial.rotation for trial in trials]),
         true_translations=np.stack([trial.translation for trial in trials]),
         scales=np.array([trial.scale for trial in trials]),
-        fitness=poses.fitness[:count],
-        converged=poses.converged[:count],
-        chamfer=chamfer[:count],
-        overlap=overlap[:count],
-        seconds=np.full(count, seconds),
+        fitness=poses.fitness,
+        converged=poses.converged,
+        chamfer=chamfer,
+        overlap=overlap,
+        seconds=np.full(len(part), seconds),
         failures=failures,
         identity=identity,
     )
 
 
 def _align(method: Method, trials: Sequence[Trial], items: Sequence[int]) -> tuple[Poses, dict[int, str]]:
-    """The poses of all trials, the identity where there is none, and the failures of those that have an item."""
+    """The poses of all trials, the identity where there is none, and the failures by item."""
     poses, reasons = _try(method, trials)
     rotation, translation = np.array(poses.rotation, np.float64), np.array(poses.translation, np.float64)
     finite = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1))
@@ -285,17 +284,21 @@ def _try(method: Method, trials: Sequence[Trial]) -> tuple[Poses, dict[int, str]
     return poses, {row: reasons[0] for row, (_, reasons) in enumerate(singles) if reasons}
 
 
-def _compare(trials: Sequence[Trial], poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+def _compare(trials: Sequence[Trial], poses: Poses, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Clean Chamfer distances, NaN where there is no clean shape, and overlaps."""
-    first = trials[0]
-    if first.clean is None:
+    count = len(trials)
+    if trials[0].clean is None:
         # Scans: their overlap is known to the protocol, and their sizes differ.
-        return np.full(len(trials), np.nan), np.full(len(trials), np.nan)
-    fields = zip(*(trial[:5] for trial in trials), strict=True)
-    source, target, rotation, translation, clean = (jnp.asarray(np.stack(field), jnp.float32) for field in fields)
-    found = Rigid(jnp.asarray(poses.rotation, jnp.float32), jnp.asarray(poses.translation, jnp.float32))
-    chamfer, overlap = _compare_all(source, target, clean, found, Rigid(rotation, translation))
-    return np.asarray(chamfer, np.float64), np.asarray(overlap, np.float64)
+        return np.full(count, np.nan), np.full(count, np.nan)
+    rows = np.arange(size) % count  # the last batch is filled up with copies, so that one program serves all
+
+    def stacked(values: Any) -> Array:
+        return jnp.asarray(np.stack(values)[rows], jnp.float32)
+
+    source, target, rotation, translation, clean = map(stacked, zip(*(trial[:5] for trial in trials), strict=True))
+    found, truth = Rigid(stacked(poses.rotation), stacked(poses.translation)), Rigid(rotation, translation)
+    chamfer, overlap = _compare_all(source, target, clean, found, truth)
+    return np.asarray(chamfer, np.float64)[:count], np.asarray(overlap, np.float64)[:count]
 
 
 @jax.jit

@@ -1,35 +1,31 @@
 """What can be evaluated: our network, alone and refined, in batches; peers and plain functions, pair by pair."""
 
 import dataclasses
-import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from urrt_jax.geometry.clouds import pad_clouds
+from urrt_jax.batches import register_pairs
 from urrt_jax.model import Model
 from urrt_jax.peers import PEERS, Peer
 from urrt_jax.refine import ICP
-from urrt_jax.registration import register
+from urrt_jax.result import Outcome
 from urrt_jax.search import Search
 from urrt_jax.weights import load_model
 
-_LARGE = 4096  # clouds beyond this are padded to whole blocks, so that few programs are compiled for scans
-_BLOCK = 16_384
 _BATCH = 32  # pairs: on a CPU, twice as many leave its caches and take an eighth longer each
 # What each of ours is told (``Ours``).
 _OURS: dict[str, dict[str, Any]] = {
     "network": {"refine": None},
     "register": {},
-    "search": {"search": Search(max_angle=90.0), "batch": 8},
-    "search_near": {"search": Search(max_angle=45.0, preference=0.2, kept=16), "informed": True, "batch": 8},
-    "search_all": {"search": Search(), "batch": 1},
+    "auto": {"search": "auto"},
+    "search": {"search": Search(max_angle=90.0)},
+    "search_near": {"search": Search(max_angle=45.0, preference=0.2, kept=16), "informed": True},
+    "search_all": {"search": Search(), "batch": 1},  # scans, each of which takes a time of its own
 }
 
 
@@ -56,7 +52,7 @@ class Method(Protocol):
 
     @property
     def batch(self) -> int:
-        """How many pairs of equal size it takes at once."""
+        """How many pairs it takes at once, at most."""
         ...
 
     def identity(self) -> dict[str, Any]:
@@ -70,12 +66,12 @@ class Method(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ours:
-    """``register`` with a model, refined or the network alone.
+    """``register_pairs`` with a model, refined or the network alone.
 
     Attributes:
       model: the network.
       refine: as for ``register``.
-      search: as for ``register``.
+      search: as for ``register``, but None by default.
       informed: whether it begins at the rotation that the protocol expects (``Trial.expected``).
       name: of the model, for titles.
       batch: pairs at once.
@@ -83,7 +79,7 @@ class Ours:
 
     model: Model
     refine: ICP | None = ICP()
-    search: Search | None = None
+    search: Search | Literal["auto"] | None = None
     informed: bool = False
     name: str = "model"
     batch: int = _BATCH
@@ -91,7 +87,9 @@ class Ours:
     @property
     def title(self) -> str:
         stages = ["network alone" if self.refine is None else "refined"]
-        if self.search is not None:
+        if self.search == "auto":
+            stages.insert(0, "searched where needed")
+        elif self.search is not None:
             stages.insert(0, "searched about the middle of the protocol's poses" if self.informed else "searched")
         return f"ours, {' and '.join(stages)} ({self.name})"
 
@@ -100,8 +98,8 @@ class Ours:
             "method": "register",
             "parameters_sha256": _digest(self.model),
             "config": dataclasses.asdict(self.model.config),
-            "refine": None if self.refine is None else dataclasses.asdict(self.refine),
-            "search": None if self.search is None else dataclasses.asdict(self.search),
+            "refine": _plain(self.refine),
+            "search": _plain(self.search),
         } | ({"informed": True} if self.informed else {})
 
     def align(
@@ -111,13 +109,15 @@ class Ours:
         expected: Sequence[np.ndarray | None] | None = None,
     ) -> Poses:
         """``Method.align``; where it is informed, ``expected`` are the rotations (3, 3) to begin at."""
-        initial = None
-        if self.informed and expected is not None and all(each is not None for each in expected):
-            initial = np.tile(np.eye(4, dtype=np.float32), (len(sources), 1, 1))
-            initial[:, :3, :3] = np.stack(expected)  # type: ignore[arg-type]
-        clouds = *_stack(sources), *_stack(targets)
-        found = _register_all(self.model, *clouds, initial, self.refine, self.search)
-        return Poses(*(np.asarray(value) for value in jax.device_get(found)))
+        initials = None
+        if self.informed and expected is not None:
+            initials = [None if turn is None else _turned(turn) for turn in expected]
+        options: Any = {"refine": self.refine, "search": self.search, "batch": self.batch}
+        found = register_pairs(sources, targets, model=self.model, initials=initials, **options)
+        refused = np.asarray(found.results.outcome) == Outcome.REFUSED
+        if np.any(refused):
+            raise ValueError(found.reasons[np.argmax(refused)])
+        return Poses(found.rotation, found.translation, found.fitness, found.converged.astype(float))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -160,8 +160,9 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
     Args:
       method: ``"network"``, ``"register"`` and ``"search"`` are ours: alone, refined, and refined after a global search
         over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans;
-        ``"search_near"``: about the middle of the protocol's own, which learned methods know from training); a model of
-        its own may follow, as in ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
+        ``"search_near"``: about the middle of the protocol's own, which learned methods know from training;
+        ``"auto"``: only where it is needed, as ``register`` does by default); a model of its own may follow, as in
+        ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
       model: what ours uses where the name says nothing of it: a packaged name or a file.
 
     Raises:
@@ -188,33 +189,6 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
     return PairByPair(function=method, title=name, settings={"function": getattr(method, "__qualname__", name)})
 
 
-@functools.partial(jax.jit, static_argnames=("refine", "search"))
-def _register_all(
-    model: Model,
-    sources: Array,
-    source_masks: Array,
-    targets: Array,
-    target_masks: Array,
-    initial: Array | None,
-    refine: ICP | None,
-    search: Search | None,
-) -> tuple[Array, ...]:
-    def one(source: Array, source_mask: Array, target: Array, target_mask: Array, initial: Array | None) -> tuple:
-        options = {"model": model, "refine": refine, "search": search, "initial": initial}
-        result = register(source, target, source_mask=source_mask, target_mask=target_mask, **options)
-        return result.rotation, result.translation, result.fitness, result.converged.astype(jnp.float32)
-
-    return jax.vmap(one)(sources, source_masks, targets, target_masks, initial)
-
-
-def _stack(clouds: Sequence[np.ndarray]) -> tuple[Array, Array]:
-    """Clouds as one array (B, N, 3) and their masks (B, N)."""
-    size = max(map(len, clouds))
-    if size > _LARGE:
-        size = -(-size // _BLOCK) * _BLOCK
-    return pad_clouds(clouds, size=size)
-
-
 def _short_name(model: str | Path) -> str:
     """What titles call a model: the name of its run, where training wrote "model.npz"."""
     path = Path(model)
@@ -226,3 +200,17 @@ def _digest(model: Model) -> str:
     for leaf in jax.tree.leaves(model.params):
         state.update(np.ascontiguousarray(leaf).tobytes())
     return state.hexdigest()
+
+
+def _plain(options: Any) -> Any:
+    """A dataclass of options as names and plain numbers, whatever arrays it holds; anything else as it is."""
+    if not dataclasses.is_dataclass(options):
+        return options
+    return {field.name: np.asarray(getattr(options, field.name)).tolist() for field in dataclasses.fields(options)}
+
+
+def _turned(rotation: np.ndarray) -> np.ndarray:
+    """The transform (4, 4) that turns."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return matrix

@@ -12,10 +12,10 @@ from jax import Array
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import make_cloud
-from urrt_jax.geometry.neighbors import nearest
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax import rigid
+from urrt_jax.clouds import make_cloud
+from urrt_jax.neighbors import nearest
+from urrt_jax.rigid import Rigid
 
 RECALLS = ((1.0, 0.05), (2.0, 0.02), (5.0, 0.05), (5.0, 0.1))
 """Recall counts a pose whose angle is below so many degrees and whose distance is below so many scales."""

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.clouds import Cloud
 
 BINS = 11
 

@@ -10,9 +10,11 @@ import itertools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.clouds import Cloud
+from urrt_jax.rigid import cross
 
 _HIGHEST = jax.lax.Precision.HIGHEST
 _ROWS = 64  # points a block
@@ -62,29 +64,27 @@ def moment_invariants(cloud: Cloud, octaves: int) -> Array:
     count = points.shape[0]
     blocks = jnp.pad(points, ((0, -count % _ROWS), (0, 0))).reshape(-1, _ROWS, 3)
     totals = jnp.moveaxis(jax.lax.map(weighted, blocks), 1, 0).reshape(octaves, -1, moments.shape[1])[:, :count]
-    shapes, offsets, masses = [], [], []
-    for width, sums in zip(widths, totals, strict=True):
-        mass = jnp.where(sums[:, 0] > 1e-6, sums[:, 0], 1.0)
-        mean = sums[:, 1:4] / mass[:, None]
-        spread = (sums[:, 4:] / mass[:, None] - mean[:, upper[0]] * mean[:, upper[1]]) / width**2
-        xx, xy, xz, yy, yz, zz = spread.T
-        area = xx * yy + xx * zz + yy * zz - xy**2 - xz**2 - yz**2
-        volume = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-        offset = (mean - points) / width
-        reach = jnp.sum(offset**2, axis=1)
-        offset = offset / jnp.sqrt(reach + _NEAR**2)[:, None]
-        x, y, z = offset.T
-        along = xx * x**2 + yy * y**2 + zz * z**2 + 2 * (xy * x * y + xz * x * z + yz * y * z)
-        shapes += [
-            xx + yy + zz,
-            jnp.sqrt(jnp.maximum(area, 0.0) + _FLAT),
-            jnp.cbrt(jnp.maximum(volume, 0.0) + _FLAT),
-            jnp.sqrt(reach + _FLAT),
-            along,
-        ]
-        offsets.append(offset)
-        masses.append(jnp.log(mass))
-    rises = [wide - narrow for narrow, wide in itertools.pairwise(masses)]
-    cosines = [jnp.sum(a * b, axis=1) for a, b in itertools.combinations(offsets, 2)]
-    triples = [jnp.sum(a * jnp.cross(b, c), axis=1) for a, b, c in itertools.combinations(offsets, 3)]
-    return jnp.where(mask[:, None], jnp.stack([*shapes, *rises, *cosines, *triples], axis=1), 0.0)
+    # All octaves at once, (K, N): what follows is compiled once instead of once an octave.
+    scale = jnp.array(widths, points.dtype)[:, None]
+    mass = jnp.where(totals[..., 0] > 1e-6, totals[..., 0], 1.0)
+    mean = totals[..., 1:4] / mass[..., None]
+    spread = (totals[..., 4:] / mass[..., None] - mean[..., upper[0]] * mean[..., upper[1]]) / scale[..., None] ** 2
+    xx, xy, xz, yy, yz, zz = jnp.moveaxis(spread, -1, 0)
+    area = xx * yy + xx * zz + yy * zz - xy**2 - xz**2 - yz**2
+    volume = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    offset = (mean - points) / scale[..., None]
+    reach = jnp.sum(offset**2, axis=-1)
+    offset = offset / jnp.sqrt(reach + _NEAR**2)[..., None]
+    x, y, z = jnp.moveaxis(offset, -1, 0)
+    along = xx * x**2 + yy * y**2 + zz * z**2 + 2 * (xy * x * y + xz * x * z + yz * y * z)
+    size = jnp.sqrt(jnp.maximum(area, 0.0) + _FLAT), jnp.cbrt(jnp.maximum(volume, 0.0) + _FLAT)
+    shapes = jnp.stack([xx + yy + zz, *size, jnp.sqrt(reach + _FLAT), along], axis=1).reshape(-1, count)
+
+    logarithm = jnp.log(mass)
+    pairs, triples = (
+        np.array(list(itertools.combinations(range(octaves), number)), int).reshape(-1, number).T for number in (2, 3)
+    )
+    cosines = jnp.sum(offset[pairs[0]] * offset[pairs[1]], axis=-1)
+    volumes = jnp.sum(offset[triples[0]] * cross(offset[triples[1]], offset[triples[2]]), axis=-1)
+    columns = jnp.concatenate([shapes, logarithm[1:] - logarithm[:-1], cosines, volumes])
+    return jnp.where(mask[:, None], columns.T, 0.0)

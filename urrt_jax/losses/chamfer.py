@@ -5,8 +5,8 @@ from typing import Literal
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.neighbors import nearest
+from urrt_jax.clouds import Cloud
+from urrt_jax.neighbors import nearest
 
 Penalty = Literal["squared", "distance", "geman_mcclure"]
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.neighbors import nearest, spacing
+from urrt_jax.clouds import Cloud
+from urrt_jax.neighbors import nearest, spacing
 
 
 def occupancy_loss(logits: Array, inside: Array, mask: Array | None = None) -> Array:

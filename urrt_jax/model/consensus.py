@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from urrt_jax.geometry.rigid import Rigid, nearest_rotation, procrustes, quick_rotation
+from urrt_jax.rigid import Rigid, nearest_rotation, procrustes, quick_rotation
 
 _HIGHEST = jax.lax.Precision.HIGHEST
 # Lengths and areas in a frame of unit radius.
@@ -48,9 +47,7 @@ def _landmarks(source: Array, target: Array) -> _Landmarks:
     return _Landmarks(source.T, target.T, products)
 
 
-def align_landmarks(
-    source: Array, target: Array, weights: Array, *, rounds: int, seeds: np.ndarray | None = None
-) -> Rigid:
+def align_landmarks(source: Array, target: Array, weights: Array, *, rounds: int, seeds: Array | None = None) -> Rigid:
     """φ: the transform that carries landmarks (M, 3) of the source onto those of the target, with weights (M,).
 
     In every round, landmarks at distance r after the alignment are weighed down by (1 + r²/s²)⁻², Geman and McClure's
@@ -77,7 +74,7 @@ def align_landmarks(
     return procrustes(source, target, weights, stiffness=_STIFFNESS)
 
 
-def hypotheses(source: Array, target: Array, weights: Array, seeds: np.ndarray) -> Rigid:
+def hypotheses(source: Array, target: Array, weights: Array, seeds: Array) -> Rigid:
     """What each of S seeds would say, rotation (S, 3, 3) and translation (S, 3), after a brief consensus of its own.
 
     Few of them may be right where the clouds look alike in several poses, or share little: who can tell poses apart by
@@ -86,8 +83,7 @@ def hypotheses(source: Array, target: Array, weights: Array, seeds: np.ndarray) 
     given, landmarks = _relative(weights), _landmarks(source, target)
 
     def said(weights: Array) -> Rigid:
-        for _ in range(_BRIEF):
-            weights = _weigh(landmarks, given, weights, quick_rotation)
+        weights = jax.lax.fori_loop(0, _BRIEF, lambda _, now: _weigh(landmarks, given, now, quick_rotation), weights)
         return procrustes(source, target, weights, stiffness=_STIFFNESS)
 
     return jax.vmap(said)(_hypothetical_weights(source, target, given, seeds))
@@ -126,21 +122,26 @@ def _misfits(landmarks: _Landmarks, weights: Array, turn: Callable[[Array], Arra
     return squares, jnp.maximum(mean, 0.0)
 
 
-def even_seeds(groups: Sequence[int], count: int) -> np.ndarray:
-    """Rows of about ``count`` landmarks that speak for hypotheses, evenly spread over groups of these sizes.
+def even_seeds(groups: Sequence[int], count: int, real: Sequence[Array | int] | None = None) -> Array:
+    """Rows of about ``count`` landmarks that seed hypotheses, evenly spread over groups of landmarks.
 
     How many a group has depends on its size alone, so that the order of the groups does not matter.
+
+    Args:
+      groups: sizes of the groups, whose landmarks follow each other.
+      count: how many seeds there are to be.
+      real: how many landmarks of each group, its first ones, are no padding; all by default.
     """
     share = min(1.0, count / max(sum(groups), 1))
-    ends, chosen = np.cumsum(groups), [math.ceil(share * size) for size in groups]
-    rows = [
-        end - size + np.arange(some) * size // max(some, 1)
-        for end, size, some in zip(ends, groups, chosen, strict=True)
-    ]
-    return np.concatenate(rows)
+    rows, begin = [jnp.zeros(0, jnp.int32)], 0
+    for size, used in zip(groups, groups if real is None else real, strict=True):
+        some = math.ceil(share * size)
+        rows.append(begin + jnp.arange(some) * used // max(some, 1))
+        begin += size
+    return jnp.concatenate(rows).astype(jnp.int32)
 
 
-def _hypothetical_weights(source: Array, target: Array, given: Array, seeds: np.ndarray) -> Array:
+def _hypothetical_weights(source: Array, target: Array, given: Array, seeds: Array) -> Array:
     """Weights (S, M) of S hypotheses: a landmark counts as much as it and others back the seed."""
     fits = _compatibility(source, target, seeds)
     backed = fits * jnp.matmul(fits[:, seeds] * given[seeds], fits)
@@ -161,12 +162,21 @@ def _best_start(landmarks: _Landmarks, given: Array, hypothetical: Array) -> Arr
 
 def _gain(landmarks: _Landmarks, given: Array, weights: Array) -> Array:
     """How much of the given weight agrees with the hypothesis of these weights (M,), two rounds after them, ()."""
-    weights = _weigh(landmarks, given, weights, quick_rotation)
-    squares, _ = _misfits(landmarks, weights, quick_rotation)
+    squares = _settled_misfits(landmarks, given, weights)
     return jnp.matmul(1 / (1 + jnp.sqrt(squares) / _NEAR), given, precision=_HIGHEST)
 
 
-def _compatibility(source: Array, target: Array, seeds: np.ndarray) -> Array:
+def _settled_misfits(landmarks: _Landmarks, given: Array, weights: Array) -> Array:
+    """Squared distances (M,) after two rounds; a loop, so that a round is compiled once."""
+
+    def again(_: int, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        squares, mean = _misfits(landmarks, now[0], quick_rotation)
+        return given / (1 + squares / (mean + _TOLERANCE**2)) ** 2, squares
+
+    return jax.lax.fori_loop(0, 2, again, (weights, weights))[1]
+
+
+def _compatibility(source: Array, target: Array, seeds: Array) -> Array:
     """How well each landmark agrees with each of S seeds, (S, M) in [0, 1), by their distances in both clouds."""
     # A length of zero has no derivative.
     here, there = (

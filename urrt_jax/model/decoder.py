@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax.clouds import Cloud
 from urrt_jax.features.moments import invariant_count
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.loops import each_cloud
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.consensus import align_landmarks, even_seeds, hypotheses
 from urrt_jax.model.encoding import Encoding
@@ -25,6 +26,7 @@ from urrt_jax.model.landmarks import (
     surroundings_keys,
 )
 from urrt_jax.model.pose import decode_poses, fuse_poses, pose_decoders
+from urrt_jax.rigid import Rigid
 
 
 def init_decoder(config: ModelConfig, key: Array) -> dict:
@@ -50,8 +52,8 @@ def decode(config: ModelConfig, params: dict, source: Encoding, target: Encoding
     if config.decoder == "pose":
         poses = decode_poses(config, params, source.regions.features, target.regions.features)
         return fuse_poses(poses, fusion_weights(source.regions.counts, target.regions.counts))
-    places, others, trust, groups = _match_landmarks(config, params, source, target)
-    seeds = even_seeds(groups, config.hypotheses)
+    places, others, trust, (sizes, real) = _match_landmarks(config, params, source, target)
+    seeds = even_seeds(sizes, config.hypotheses, real)
     return align_landmarks(places, others, trust, rounds=config.consensus, seeds=seeds)
 
 
@@ -59,34 +61,42 @@ def decode_hypotheses(config: ModelConfig, params: dict, source: Encoding, targe
     """About ``count`` transforms, stacked, that landmarks speak for; of decoders that regress the pose, their one."""
     if config.decoder == "pose":
         return jax.tree.map(lambda leaf: leaf[None], decode(config, params, source, target))
-    places, others, trust, groups = _match_landmarks(config, params, source, target)
-    return hypotheses(places, others, trust, even_seeds(groups, count))
+    places, others, trust, (sizes, real) = _match_landmarks(config, params, source, target)
+    return hypotheses(places, others, trust, even_seeds(sizes, count, real))
 
 
 def _match_landmarks(
     config: ModelConfig, params: dict, source: Encoding, target: Encoding
-) -> tuple[Array, Array, Array, list[int]]:
-    """Places (M, 3) of landmarks in both clouds, how much each counts (M,), and the sizes of the groups they are in.
+) -> tuple[Array, Array, Array, tuple[list[int], list[Array | int]]]:
+    """Places (M, 3) of landmarks in both clouds, how much each counts (M,), and the groups they are in.
+
+    A group has a size and a number of landmarks that are no padding.
 
     Those of the decoders come first, then those of the source's points and of the target's.
     """
     weights = fusion_weights(source.regions.counts, target.regions.counts)
     queries = region_queries(config, params["landmarks"], source.regions.features, target.regions.features, weights)
-    asked, groups, trust = len(queries.weights), [len(queries.weights)], [queries.weights]
+    asked, trust = len(queries.weights), [queries.weights]
+    groups: list[int] = [asked]
+    counts: list[Array | int] = [asked]
     if config.lookups:
         keys, real, _ = map(jnp.concatenate, zip(source.lookups, target.lookups, strict=True))
         # As many of either cloud's points, so that swapped clouds have the same ones.
         groups += [len(source.lookups.real), len(target.lookups.real)]
+        counts += [jnp.sum(source.lookups.real), jnp.sum(target.lookups.real)]
         trust.append(lookup_weights(config, params["trust"], keys, real))
-    here = _find(config, queries.source, target.lookups.keys, source)
-    there = _find(config, queries.target, source.lookups.keys, target)
+    here, there = each_cloud(
+        lambda side: _find(config, *side),
+        (queries.source, target.lookups.keys, source.keys, source.cloud),
+        (queries.target, source.lookups.keys, target.keys, target.cloud),
+    )
     places = jnp.concatenate([here[:asked], source.lookups.places, here[asked:]])
-    return places, jnp.concatenate([there, target.lookups.places]), jnp.concatenate(trust), groups
+    return places, jnp.concatenate([there, target.lookups.places]), jnp.concatenate(trust), (groups, counts)
 
 
-def _find(config: ModelConfig, queries: Array, others: Array, cloud: Encoding) -> Array:
+def _find(config: ModelConfig, queries: Array, others: Array, keys: Array, cloud: Cloud) -> Array:
     """Where a cloud has what the decoders ask for, and the other cloud's points with their keys."""
-    return place_landmarks(config.sharpness * jnp.concatenate([queries, others]), cloud.keys, cloud.cloud)
+    return place_landmarks(config.sharpness * jnp.concatenate([queries, others]), keys, cloud)
 
 
 def fusion_weights(source_counts: Array, target_counts: Array) -> Array:

@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.clouds import Cloud
 from urrt_jax.model.blocks import Perceptron, run
 from urrt_jax.model.config import ModelConfig
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.clouds import Cloud
 from urrt_jax.model.attention import attend_regions
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.encoder import encode_points

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud
+from urrt_jax.clouds import Cloud
 from urrt_jax.model.blocks import Perceptron, region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
 

@@ -11,16 +11,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax import rigid
+from urrt_jax.clouds import Cloud, subsample
 from urrt_jax.features.moments import invariant_count, moment_invariants
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud, denormalize_translation, normalize_pair, subsample
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax.frames import normalize_pair
+from urrt_jax.loops import each_cloud, largest
 from urrt_jax.model.attention import RegionTransformer
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.decoder import decode, decode_hypotheses, init_decoder
 from urrt_jax.model.encoder import PointEncoder
 from urrt_jax.model.encoding import Encoding, encode_cloud
 from urrt_jax.model.partition import RegionBranches, branch_logits, region_labels
+from urrt_jax.rigid import Rigid
 
 
 @jax.tree_util.register_dataclass
@@ -76,17 +78,16 @@ def encode(model: Model, cloud: Cloud) -> Encoding:
     return encode_cloud(model.config, model.params, cloud, moment_invariants(cloud, model.config.octaves))
 
 
-def estimate(model: Model, source: Cloud, target: Cloud, start: Rigid | None = None) -> Estimate:
+def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
     """The transform from source to target, of two clouds normalised together (``normalize_pair``).
 
     The network is applied ``config.steps`` times, each time to the source as moved so far; no derivative passes from
     one step to the one before it. The target is encoded once. Labels of regions carry no derivative (hard arg-max).
-    ``start`` is what the first step takes for the estimate so far; the identity where there is none. Real points should
-    come first, as ``subsample`` leaves them: among them those are chosen that are looked up.
+    Real points should come first, as ``subsample`` leaves them: among them those are chosen that are looked up.
     """
     config, params = model.config, model.params
-    target_encoding = encode(model, target)
-    invariants = moment_invariants(source, config.octaves)
+    invariants, target_invariants = each_cloud(lambda cloud: moment_invariants(cloud, config.octaves), source, target)
+    target_encoding = encode_cloud(config, params, target, target_invariants)
 
     def step(before: Rigid, _: None) -> tuple[Rigid, tuple[Rigid, Rigid, Encoding]]:
         seen = jax.tree.map(jax.lax.stop_gradient, before)
@@ -95,10 +96,7 @@ def estimate(model: Model, source: Cloud, target: Cloud, start: Rigid | None = N
         after = rigid.compose(decode(config, params["decoder"], encoding, target_encoding), seen)
         return after, (after, seen, encoding)
 
-    begin = rigid.identity()
-    if start is not None:
-        begin = jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), start, begin)
-    last, (steps, seen, encodings) = jax.lax.scan(step, begin, None, length=config.steps)
+    last, (steps, seen, encodings) = jax.lax.scan(step, rigid.identity(), None, length=config.steps)
     final_seen, final_encoding = jax.tree.map(lambda values: values[-1], (seen, encodings))
     return Estimate(last, steps, final_seen, final_encoding, target_encoding)
 
@@ -109,7 +107,9 @@ def propose(model: Model, source: Cloud, target: Cloud, count: int) -> Rigid:
     Where ``estimate`` gives the one on which most landmarks agree, these are what single ones and those compatible with
     them would say. Clouds as for ``estimate``.
     """
-    return decode_hypotheses(model.config, model.params["decoder"], encode(model, source), encode(model, target), count)
+    return decode_hypotheses(
+        model.config, model.params["decoder"], *each_cloud(lambda cloud: encode(model, cloud), source, target), count
+    )
 
 
 def estimate_subsampled(model: Model, source: Cloud, target: Cloud) -> Estimate:
@@ -120,21 +120,31 @@ def estimate_subsampled(model: Model, source: Cloud, target: Cloud) -> Estimate:
 def predict(model: Model, source: Cloud, target: Cloud) -> Rigid:
     """The network's transform between two clouds in any units: normalises, estimates, undoes the normalisation."""
     source, target, frame = normalize_pair(source, target)
-    rotation, translation = estimate_subsampled(model, source, target).transform
-    return Rigid(rotation, denormalize_translation(rotation, translation, frame))
+    return frame.leave(estimate_subsampled(model, source, target).transform)
 
 
-def point_regions(model: Model, points: Array, encoding: Encoding, *, batch_size: int = 2048) -> Array:
+def point_regions(
+    model: Model, points: Array, encoding: Encoding, *, count: Array | None = None, batch_size: int = 2048
+) -> Array:
     """The region label (N,) int32 of any points (N, 3) in the network's frame; zeros for model A.
 
-    Large clouds go through in chunks of ``batch_size`` points, which a processor's cache holds.
+    Args:
+      model: the network.
+      points: on the cloud or off it.
+      encoding: of the cloud whose regions these are.
+      count: (), the points from this row on are padding and get label 0; None where all are wanted.
+      batch_size: large clouds go through in chunks of so many points, which a processor's cache holds.
     """
+    size = points.shape[0]
     if not model.config.has_regions:
-        return jnp.zeros(points.shape[0], jnp.int32)
+        return jnp.zeros(size, jnp.int32)
+    chunk = min(size, batch_size)
+    chunks = jnp.pad(points, ((0, -size % chunk), (0, 0))).reshape(-1, chunk, 3)
 
-    def label(some: Array) -> Array:
-        return region_labels(branch_logits(model.config, model.params["partition"], some, encoding.embedding))
+    def label(number: Array, labels: Array) -> Array:
+        logits = branch_logits(model.config, model.params["partition"], chunks[number], encoding.embedding)
+        return labels.at[number].set(region_labels(logits))
 
-    if points.shape[0] <= batch_size:
-        return label(points)
-    return jax.lax.map(lambda point: label(point[None])[0], points, batch_size=batch_size)
+    used = largest(jnp.array(size) if count is None else count)
+    labels = jax.lax.fori_loop(0, (used + chunk - 1) // chunk, label, jnp.zeros(chunks.shape[:2], jnp.int32))
+    return labels.reshape(-1)[:size]

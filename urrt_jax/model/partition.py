@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.clouds import Cloud, centroid
+from urrt_jax.clouds import Cloud, centroid
 from urrt_jax.model.blocks import run
 from urrt_jax.model.config import ModelConfig
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry.rigid import Rigid, rotation_from_6d
 from urrt_jax.model.blocks import region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
+from urrt_jax.rigid import Rigid, rotation_from_6d
 
 _IDENTITY_6D = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 

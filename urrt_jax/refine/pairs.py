@@ -1,43 +1,42 @@
-"""Corresponding points of two clouds, looked for in both directions, and how much each pair counts."""
+"""Correspondences of two clouds: every query point of either cloud with its nearest neighbour in the other one."""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.blocks import Blocks
-from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.neighbors import nearest
-from urrt_jax.geometry.rigid import Rigid
-
-_COINCIDING = 1e-12  # squared: where all pairs coincide, none is left out
-_TRIM_POWER = 3  # of the overlap in the trimmed distance, for surfaces (Phillips et al. 2007, section 4)
+from urrt_jax import rigid
+from urrt_jax.clouds import Cloud
+from urrt_jax.neighbors import Blocks, nearest
+from urrt_jax.rigid import Rigid
 
 
 class Surface(NamedTuple):
-    """What refinement knows of a cloud.
+    """What refinement knows of a cloud of N points.
 
     Attributes:
-      asking: K of its points, which look for their neighbours.
-      normals: (K, 3), the unit normals there.
-      answering: all of its points, among which the other cloud's neighbours are found.
+      queries: Q of its points, which look for their nearest neighbours in the other cloud.
+      normals: (Q, 3), the unit normals there.
+      cloud: all of its points, among which the other cloud's queries find theirs.
+      blocks: of a large cloud (``neighbors.make_blocks``).
     """
 
-    asking: Cloud
+    queries: Cloud
     normals: Array
-    answering: Cloud | Blocks
+    cloud: Cloud
+    blocks: Blocks | None
 
 
 class Pairs(NamedTuple):
-    """Pairs of points, in the target's frame: first those that the source asked for, then the target's.
+    """P = 2·Q correspondences in the target's frame: first those of the source's queries, then those of the target's.
 
     Attributes:
       source: (P, 3), the source's points where the transform puts them.
       target: (P, 3).
-      normals: (P, 3), at the one that asked.
-      squared: (P,), the squared distance; inf for a pair that is none.
-      rows: (P,) int32, of the one that was found in its cloud.
+      normals: (P, 3), at the query's end.
+      squared: (P,), the squared distance; inf for a row that is no correspondence.
+      rows: (P,) int32, the row of the neighbour in its cloud.
     """
 
     source: Array
@@ -47,64 +46,45 @@ class Pairs(NamedTuple):
     rows: Array
 
 
-def find_pairs(source: Surface, target: Surface, transform: Rigid, within: Array | float, *, mutual: bool) -> Pairs:
-    """The pairs closer than ``within`` when the source is moved by ``transform``."""
-    moved = rigid.apply(transform, source.asking.points)
-    forth = nearest(moved, target.answering, within=within)
-    asked = rigid.apply(rigid.inverse(transform), target.asking.points)
-    back = nearest(asked, source.answering, within=within)
-    pairs = pair_up(source, target, transform, jnp.concatenate([forth.index, back.index]))
-    squared = jnp.concatenate([forth.squared, back.squared])
-    # Padding and pairs beyond the limit are none; mutual pairs are as near as the nearest to either end.
-    usable = jnp.isfinite(squared) & jnp.concatenate([source.asking.mask, target.asking.mask])
-    if mutual:
-        usable &= _mutual(pairs, source, target, transform, within)
-    return pairs._replace(squared=jnp.where(usable, pairs.squared, jnp.inf))
+def both(source: Surface, target: Surface) -> Surface:
+    """The surfaces of both clouds as one, with a leading axis: source, target. They must have the same sizes."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), source, target)
 
 
-def pair_up(source: Surface, target: Surface, transform: Rigid, rows: Array) -> Pairs:
-    """The pairs whose found ends are these rows (P,), differentiable in both clouds and the transform."""
-    count = source.asking.points.shape[0]
-    forth, back = rows[:count], rows[count:]
-    moved = rigid.apply(transform, jnp.concatenate([source.asking.points, _points(source)[back]]))
-    fixed = jnp.concatenate([_points(target)[forth], target.asking.points])
-    normals = jnp.concatenate([rigid.rotate(transform.rotation, source.normals), target.normals])
+def find_pairs(surfaces: Surface, transform: Rigid, within: Array | float) -> Pairs:
+    """The correspondences closer than ``within`` when the source is moved by ``transform``.
+
+    Args:
+      surfaces: of ``both`` clouds.
+      transform: from source to target.
+      within: ().
+    """
+    moved = rigid.apply(transform, surfaces.queries.points[0])
+    back = rigid.apply(rigid.inverse(transform), surfaces.queries.points[1])
+    placed = jnp.stack([moved, back])
+
+    def search(side: Array) -> tuple[Array, Array]:
+        cloud, blocks = jax.tree.map(lambda leaf: leaf[1 - side], (surfaces.cloud, surfaces.blocks))
+        return nearest(placed[side], cloud, blocks=blocks, within=within, ordered=True)
+
+    # A loop over the two directions: the search is compiled once.
+    rows, squared = jax.lax.map(search, jnp.arange(2))
+    usable = jnp.isfinite(squared) & surfaces.queries.mask
+    pairs = pair_up(surfaces, transform, rows.ravel())
+    return pairs._replace(squared=jnp.where(usable.ravel(), pairs.squared, jnp.inf))
+
+
+def pair_up(surfaces: Surface, transform: Rigid, rows: Array) -> Pairs:
+    """The correspondences with these neighbours (P,), differentiable in both clouds and the transform."""
+    forth, back = rows.reshape(2, -1)
+    queries, points, normals = surfaces.queries.points, surfaces.cloud.points, surfaces.normals
+    moved = rigid.apply(transform, jnp.concatenate([queries[0], points[0][back]]))
+    fixed = jnp.concatenate([points[1][forth], queries[1]])
+    normals = jnp.concatenate([rigid.rotate(transform.rotation, normals[0]), normals[1]])
     return Pairs(moved, fixed, normals, jnp.sum((moved - fixed) ** 2, axis=-1), rows)
 
 
-def _points(surface: Surface) -> Array:
-    answering = surface.answering
-    return (answering.cloud if isinstance(answering, Blocks) else answering).points
-
-
-def _mutual(pairs: Pairs, source: Surface, target: Surface, transform: Rigid, within: Array | float) -> Array:
-    """Which pairs (P,) are such that the found end's own nearest asking point is the one that asked."""
-    count = source.asking.points.shape[0]
-    moved = source.asking._replace(points=rigid.apply(transform, source.asking.points))
-    forth = nearest(pairs.target[:count], moved, within=within)
-    back = nearest(pairs.source[count:], target.asking, within=within)
-    # Points that coincide are as near as each other.
-    return jnp.concatenate([forth.squared, back.squared]) >= pairs.squared * (1 - 1e-5)
-
-
-def robust_weights(squared: Array, reach: Array) -> Array:
-    """Geman and McClure's weights (1 + d²/r²)⁻² of squared distances (P,): a quarter at ``reach``, 0 at infinity."""
-    return jnp.where(jnp.isfinite(squared), (1 + jnp.where(jnp.isfinite(squared), squared, 0.0) / reach**2) ** -2, 0.0)
-
-
-def trimmed(squared: Array) -> Array:
-    """Which pairs (P,) the overlap is estimated to hold: the nearest, as many as minimise the fractional distance.
-
-    The root mean square of the nearest share f of distances, over f³ (Phillips, Liu and Tomasi 2007, eq. 2, squared
-    here): leaving pairs out must pay.
-    """
-    order = jnp.argsort(squared)
-    ordered = squared[order]
-    finite = jnp.isfinite(ordered)
-    number = jnp.arange(1, len(ordered) + 1)
-    share = number / jnp.maximum(jnp.sum(finite), 1)
-    mean = jnp.cumsum(jnp.where(finite, ordered, 0.0)) / number
-    # Below a tenth there is always a handful of pairs that coincide.
-    cost = jnp.where(finite & (share >= 0.1), (mean + _COINCIDING) / share ** (2 * _TRIM_POWER), jnp.inf)
-    kept = jnp.arange(len(ordered)) <= jnp.argmin(cost)
-    return jnp.zeros(len(ordered), bool).at[order].set(kept & finite)
+def robust_weights(squared: Array, width: Array) -> Array:
+    """Geman and McClure's weights (1 + d²/w²)⁻² of squared distances (P,): a quarter at the width, 0 at infinity."""
+    finite = jnp.isfinite(squared)
+    return jnp.where(finite, (1 + jnp.where(finite, squared, 0.0) / width**2) ** -2, 0.0)

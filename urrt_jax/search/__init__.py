@@ -1,7 +1,6 @@
 """Global search: hypotheses from matched features and from the network's landmarks, the best of which are refined."""
 
 from urrt_jax.search.config import Search
-from urrt_jax.search.cover import rotation_cover
-from urrt_jax.search.search import Found, search
+from urrt_jax.search.search import DENSE, Found, search_quickly, search_thoroughly
 
-__all__ = ["Found", "Search", "rotation_cover", "search"]
+__all__ = ["DENSE", "Found", "Search", "search_quickly", "search_thoroughly"]

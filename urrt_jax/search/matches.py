@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.rigid import Rigid, procrustes
+from urrt_jax import rigid
+from urrt_jax.clouds import Cloud
+from urrt_jax.rigid import Rigid, procrustes
 
 
 class Matches(NamedTuple):

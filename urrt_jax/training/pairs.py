@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax import rigid
+from urrt_jax.clouds import Cloud
+from urrt_jax.rigid import Rigid
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

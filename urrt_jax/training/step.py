@@ -8,13 +8,14 @@ import optax
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from urrt_jax.geometry import rigid
-from urrt_jax.geometry.clouds import Cloud, normalize_pair, shift
-from urrt_jax.geometry.rigid import Rigid
+from urrt_jax import rigid
+from urrt_jax.clouds import first, shift
+from urrt_jax.frames import normalize_pair
 from urrt_jax.losses import chamfer, occupancy_loss, shell_samples
 from urrt_jax.model import Model
 from urrt_jax.model.network import estimate_subsampled
 from urrt_jax.model.partition import branch_logits, occupancy_logits
+from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, corruption_share, make_batch
 from urrt_jax.training.state import TrainConfig, TrainState, optimizer
 
@@ -30,8 +31,8 @@ def pair_loss(model: Model, pair: Pair, key: Array, config: TrainConfig) -> tupl
     source, target, frame = normalize_pair(pair.source, pair.target)
     result = estimate_subsampled(model, source, target)
 
-    whole_source = _head(shift(pair.whole_source, frame.source_center, frame.scale), config.loss_points)
-    whole_target = _head(shift(pair.whole_target, frame.target_center, frame.scale), config.loss_points)
+    whole_source = first(shift(pair.whole_source, frame.source_center, frame.scale), config.loss_points)
+    whole_target = first(shift(pair.whole_target, frame.target_center, frame.scale), config.loss_points)
 
     def aligned(transform: Rigid) -> Array:
         moved = whole_source._replace(points=rigid.apply(transform, whole_source.points))
@@ -56,11 +57,6 @@ def pair_loss(model: Model, pair: Pair, key: Array, config: TrainConfig) -> tupl
         }
         loss = loss + config.occupancy_weight * occupancy
     return loss, {"loss": loss} | metrics
-
-
-def _head(cloud: Cloud, count: int) -> Cloud:
-    """The first ``count`` points; the pairs' points are in random order already."""
-    return Cloud(cloud.points[:count], cloud.mask[:count])
 
 
 def batch_loss(params: dict, batch: Pair, key: Array, config: TrainConfig) -> tuple[Array, Metrics]:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.geometry import rigid
+from urrt_jax import rigid
 from urrt_jax.model import Model
 from urrt_jax.model.network import predict
 from urrt_jax.training.pairs import Pair, make_batch

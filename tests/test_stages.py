@@ -1,0 +1,318 @@
+"""The stages of a registration: what is compiled and run for which pairs, that padding changes no answer, and "auto".
+
+All clouds have at most 256 points, the first rung of the ladder, except where rungs are what is tested.
+"""
+
+import contextlib
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from urrt_jax import ICP, Registration, Search, programs, register, registration, stages
+from urrt_jax.host import PairOnHost, abstract_pair
+from urrt_jax.programs import Program
+from urrt_jax.registration import make_options
+from urrt_jax.stages import register_in_frame, rung
+
+_COMPILED = "/jax/core/compile/backend_compile_duration"
+_USUAL = {"prepare", "estimate", "approach", "settle", "assess", "label"}
+_RARE = {"search_quickly", "search_thoroughly", "settle_thinned", "expect"}
+_AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
+_SHIFT = np.array([0.4, -0.2, 0.7])
+
+
+def _turn(degrees: float) -> np.ndarray:
+    return Rotation.from_rotvec(np.deg2rad(degrees) * _AXIS).as_matrix()
+
+
+def _moved(points: np.ndarray, degrees: float) -> np.ndarray:
+    return (points @ _turn(degrees).T + _SHIFT).astype(np.float32)
+
+
+def _degrees(first, second) -> float:
+    turn = np.asarray(first, np.float64).T @ np.asarray(second, np.float64)
+    return float(np.rad2deg(Rotation.from_matrix(turn).magnitude()))
+
+
+@contextlib.contextmanager
+def _compilations() -> Iterator[list[str]]:
+    """The names of what XLA compiles (or JAX's cache on disk spares it from compiling) meanwhile."""
+    names = []
+
+    def note(event: str, _: float, **about: str | int) -> None:
+        if event == _COMPILED:
+            names.append(str(about.get("fun_name", "")))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        yield names
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+
+
+@pytest.fixture
+def called(monkeypatch) -> list[str]:
+    """The names of the stages that are called from now on. On abstract values none is compiled."""
+    names = []
+
+    def recorded(name: str, program: Program):
+        def call(*arguments):
+            names.append(name)
+            if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in jax.tree.leaves(arguments)):
+                return jax.eval_shape(program.function, *arguments)
+            return program(*arguments)
+
+        return call
+
+    for name, program in list(vars(stages).items()):
+        if isinstance(program, Program):
+            monkeypatch.setattr(stages, name, recorded(name, program))
+    monkeypatch.setattr(registration, "compile_ahead", lambda *_: None)
+    return names
+
+
+@pytest.fixture(scope="module")
+def call(small_model):
+    """``register`` with the small model."""
+
+    def register_small(source, target, **options) -> Registration:
+        return register(source, target, **({"model": small_model} | options))
+
+    return register_small
+
+
+@pytest.fixture(scope="module")
+def clean(cloud) -> tuple[np.ndarray, np.ndarray]:
+    """A cloud and the same points moved, which the network and refinement align."""
+    return cloud, _moved(cloud, 10)
+
+
+@pytest.fixture(scope="module")
+def hard(cloud) -> tuple[np.ndarray, np.ndarray]:
+    """A cloud and the same points turned so far that the network and refinement do not align them."""
+    return cloud, _moved(cloud, 150)
+
+
+@pytest.fixture(scope="module")
+def sparse(make_cloud_points) -> tuple[np.ndarray, np.ndarray]:
+    """Independent samples of one shape with noise: 250 points each, no two of which correspond."""
+    rng = np.random.default_rng(0)
+    source, target = (rng.permutation(make_cloud_points(seed, 2))[:250] for seed in (1, 2))
+    noise = rng.normal(scale=0.02, size=(2, 250, 3)).astype(np.float32)
+    return source + noise[0], _moved(target, 5) + noise[1]
+
+
+@pytest.mark.parametrize(
+    ("count", "size"), [(1, 256), (256, 256), (257, 1024), (1024, 1024), (1025, 4096), (40_000, 65_536)]
+)
+def test_rungs_are_powers_of_four(count, size):
+    assert rung(count) == size
+
+
+def test_a_clean_pair_runs_no_rare_stage(called, call, clean):
+    assert bool(call(*clean).converged)
+    assert set(called) == _USUAL
+
+
+def test_a_sparse_noisy_pair_runs_the_third_stage_of_refinement(called, call, sparse):
+    call(*sparse, search=None)
+    assert set(called) == _USUAL | {"expect"}
+
+
+def test_a_pair_turned_far_runs_the_search(called, call, hard):
+    call(*hard)
+    assert set(called) == _USUAL | {"search_thoroughly"}
+
+
+def test_without_search_a_pair_turned_far_runs_none(called, call, hard):
+    call(*hard, search=None)
+    assert not _RARE & set(called) - {"expect"}
+
+
+def test_a_search_that_is_asked_for_runs_for_a_clean_pair_too(called, call, clean):
+    call(*clean, search=Search())
+    assert set(called) == _USUAL | {"search_thoroughly"}
+
+
+def test_without_refinement_the_network_is_all_that_runs(called, call, hard):
+    call(*hard, refine=None)
+    assert set(called) == {"prepare", "estimate", "assess", "label"}
+
+
+@pytest.mark.parametrize(("rare", "expected"), [(False, _USUAL), (True, _USUAL | _RARE)])
+def test_rare_stages_are_compiled_ahead_only_where_that_is_asked_for(called, small_model, rare, expected):
+    register_in_frame(make_options(small_model, ICP(), "auto"), *abstract_pair(256), rare=rare)
+    assert set(called) == expected
+
+
+def test_rare_stages_are_compiled_for_the_first_pair_that_needs_them(monkeypatch, call, clean, sparse, hard):
+    """As in a new process."""
+    known: dict = {}
+    monkeypatch.setattr(programs, "_compilations", known)
+    monkeypatch.setattr(registration, "_asked_for", set())
+    names = lambda: {key[0].name for key in known}  # noqa: E731
+    call(*clean)
+    assert names() == _USUAL
+    call(*sparse, search=None)
+    assert names() == _USUAL | {"expect"}
+    call(*hard)
+    assert names() == _USUAL | {"expect", "search_thoroughly"}
+
+
+def _random_pair(rng: np.random.Generator, cloud: np.ndarray) -> dict:
+    """Arguments of ``register``: a pair of other sizes, as arrays of another kind, with other options."""
+    kinds = [
+        lambda points: points.astype(np.float32),
+        lambda points: points.astype(np.float64),
+        lambda points: jax.device_put(points.astype(np.float32)),  # asarray would compile
+    ]
+    arguments: dict = {}
+    for name, points in (("source", cloud), ("target", cloud @ _turn(rng.uniform(0, 180)).T + rng.normal(size=3))):
+        count = int(rng.integers(20, 200))
+        points = rng.permutation(points)[:count] + rng.normal(scale=rng.choice([0.0, 0.03]), size=(count, 3))
+        if rng.uniform() < 0.5:
+            mask = rng.uniform(size=count + 56) < 0.9
+            points = np.concatenate([points, rng.normal(size=(56, 3))])
+            arguments[f"{name}_mask"] = jax.device_put(mask) if rng.uniform() < 0.5 else mask
+        arguments[name] = kinds[rng.integers(3)](points)
+    if rng.uniform() < 0.5:
+        arguments["initial"] = np.block([[_turn(rng.uniform(0, 90)), rng.normal(size=(3, 1))], [np.eye(4)[3:]]])
+    if rng.uniform() < 0.5:
+        arguments["inlier_distance"] = kinds[rng.integers(3)](np.array(rng.uniform(0.01, 0.5)))
+    arguments["refine"] = ICP(
+        coarse_iterations=int(rng.integers(5, 40)),
+        reach=float(rng.choice([rng.uniform(0.2, 0.6), 1])),
+        iterations=int(rng.integers(5, 80)),
+        inlier_distance=rng.uniform(0.5, 2),
+        plane=rng.choice([0, 1, 0.5]),
+        normal_radius=int(rng.integers(2, 5)),
+        tolerance=rng.uniform(1e-5, 1e-3),
+    )
+    if rng.uniform() < 0.3:
+        arguments["search"] = Search(
+            max_angle=int(rng.integers(20, 180)), preference=rng.uniform(), margin=rng.uniform(), sure=1
+        )
+    return arguments
+
+
+def test_after_one_pair_of_each_kind_nothing_is_compiled_on_a_rung(call, cloud, clean, sparse, hard):
+    for pair in (clean, sparse, hard):
+        call(*pair)
+    call(*sparse, search=None)
+    rng = np.random.default_rng(0)
+    with _compilations() as names:
+        for _ in range(50):
+            call(**_random_pair(rng, cloud))
+    assert names == []
+
+
+def test_the_first_pair_on_a_rung_compiles_each_usual_stage_once(monkeypatch, call, clean):
+    monkeypatch.setattr(programs, "_compilations", {})
+    monkeypatch.setattr(registration, "_asked_for", set())
+    with _compilations() as names:
+        call(*clean)
+    assert sorted(name.removeprefix("jit_").removeprefix("jit(").removesuffix(")") for name in names) == sorted(_USUAL)
+
+
+def _padded(points: np.ndarray, rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The points in their order among ``rows`` rows, of which any may be padding, and the mask."""
+    mask = np.zeros(rows, bool)
+    mask[np.random.default_rng(seed).permutation(rows)[: len(points)]] = True
+    values = np.full((rows, 3), 3.0, np.float32)
+    values[mask] = points
+    return values, mask
+
+
+@pytest.mark.parametrize("rows", [256, 700, 4200])
+def test_padding_of_arrays_changes_no_answer(call, sparse, rows):
+    expected = call(*sparse)
+    (source, source_mask), (target, target_mask) = (_padded(points, rows, k) for k, points in enumerate(sparse))
+    found = call(source, target, source_mask=source_mask, target_mask=target_mask)
+    for name in ("matrix", "fitness", "rmse", "overlap", "confidence", "converged", "outcome", "steps"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+    np.testing.assert_array_equal(found.source_regions[source_mask], expected.source_regions)
+    np.testing.assert_array_equal(found.target_regions[target_mask], expected.target_regions)
+
+
+@pytest.mark.parametrize("kind", ["clean", "sparse", "hard"])
+def test_a_higher_rung_changes_no_answer(request, small_model, kind):
+    """The stages themselves see four times as many rows."""
+    source, target = request.getfixturevalue(kind)
+    options = make_options(small_model, ICP(), "auto")
+    pair = PairOnHost(source, target)
+    found, expected = (
+        pair.restore(jax.device_get(register_in_frame(options, *pair.padded(size)))) for size in (1024, 256)
+    )
+    for name in ("rotation", "translation"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-5, err_msg=name)
+    for name in ("fitness", "rmse", "overlap", "confidence", "inlier_distance"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4, err_msg=name)
+    np.testing.assert_allclose(found.information, expected.information, rtol=1e-4, atol=1e-3)
+    for name in ("converged", "outcome", "correspondences", "source_regions", "target_regions"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def automatic(small_model):
+    """``register`` with its own search, under jit."""
+    return jax.jit(lambda source, target: register(source, target, model=small_model))
+
+
+def test_without_search_a_turn_by_150_degrees_is_missed(call, hard):
+    """Otherwise the tests of "auto" would test nothing."""
+    assert _degrees(call(*hard, search=None).rotation, _turn(150)) > 20
+
+
+def test_auto_finds_a_turn_by_150_degrees(call, hard):
+    result = call(*hard)
+    assert _degrees(result.rotation, _turn(150)) < 0.1
+    assert bool(result.converged)
+
+
+@pytest.mark.parametrize("kind", ["clean", "hard"])
+def test_auto_under_jit_gives_the_eager_result(request, call, automatic, kind):
+    pair = request.getfixturevalue(kind)
+    _check_same(automatic(*pair), call(*pair))
+
+
+def test_auto_under_vmap_finds_a_turn_by_150_degrees_beside_a_pair_that_needs_no_search(call, small_model, clean, hard):
+    sources, targets = (jnp.asarray(np.stack(sides)) for sides in zip(clean, hard, strict=True))
+    together = jax.vmap(lambda source, target: register(source, target, model=small_model))(sources, targets)
+    for row, pair in enumerate((clean, hard)):
+        _check_same(jax.tree.map(lambda leaf, row=row: leaf[row], together), call(*pair))
+
+
+def _check_same(found: Registration, expected: Registration) -> None:
+    assert np.deg2rad(_degrees(found.rotation, expected.rotation)) < 1e-4
+    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-4)
+    np.testing.assert_array_equal(found.correspondences, expected.correspondences)
+    assert float(found.confidence) == pytest.approx(float(expected.confidence), abs=1e-3)
+    assert int(found.outcome) == int(expected.outcome)
+    assert (found.correspondences.shape, found.rotation.dtype) == (expected.correspondences.shape, jnp.float32)
+
+
+_GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 6)] * 3), -1).reshape(-1, 3)
+_CUBE = _GRID[np.abs(_GRID).max(axis=1) > 0.99]
+_ROUND = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+_PRISM = np.stack([np.tile(f(_ROUND), 8) for f in (np.cos, np.sin)] + [np.repeat(np.linspace(-1.5, 1.5, 8), 20)], -1)
+
+
+@pytest.mark.parametrize(
+    "points", [_CUBE, _CUBE * [1, 1, 2], _CUBE * [1, 1.5, 2], _PRISM], ids=["cube", "tower", "box", "prism"]
+)
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_auto_does_not_turn_a_symmetric_shape_around(call, points, noise):
+    """The pose that turns least stays, though others fit as well, whether or not the search looks at them."""
+    rng = np.random.default_rng(0)
+    source, target = points + noise * rng.normal(size=points.shape), points @ _turn(6).T
+    target = (target + noise * rng.normal(size=points.shape)).astype(np.float32)
+    assert _degrees(call(source.astype(np.float32), target).rotation, _turn(6)) < 4
+
+
+def test_swapping_a_pair_that_is_searched_gives_the_inverse(call, hard):
+    forth, back = call(*hard), call(*reversed(hard))
+    np.testing.assert_allclose(back.matrix @ forth.matrix, np.eye(4), atol=1e-4)

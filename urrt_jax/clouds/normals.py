@@ -1,0 +1,127 @@
+"""Normals of clouds: masked local principal component analysis."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from urrt_jax.clouds.cloud import Cloud
+from urrt_jax.loops import largest
+from urrt_jax.rigid import cross
+
+_BLOCK = 8
+_HIGHEST = jax.lax.Precision.HIGHEST
+_SINGULAR = 1e-4  # what rounding leaves of a cross product of rows of size 1 that should vanish
+
+
+def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array) -> Array:
+    """Unit normals (N, 3) of the surface that ``cloud`` samples, at ``points`` (N, 3).
+
+    The direction in which the cloud's points within ``radius`` vary least (Hoppe et al. 1992). Its sign is the one that
+    points away from ``centre`` (3,), the cloud's centroid, say: scans and solids are oriented alike then, wherever they
+    are not seen edge-on. Where fewer than three points are near, it is still a unit vector, of no meaning. Derivatives
+    are those of the neighbourhoods at hand.
+
+    Args:
+      points: where.
+      cloud: M points; the loop goes over them once, for all N at a time, so memory is O(N + M).
+      radius: of the neighbourhood.
+      centre: what normals point away from.
+    """
+    spread = jnp.moveaxis(_spreads(points, cloud, jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))), -1, 0)
+    normal = jax.vmap(least_axis)(spread)
+    inward = jnp.sum(normal * (points - centre), axis=-1, keepdims=True) < 0
+    return jnp.where(inward, -normal, normal)
+
+
+@jax.custom_jvp
+def _spreads(points: Array, cloud: Cloud, radius: Array) -> Array:
+    """The covariances (3, 3, N) of the offsets, in radii, from each point to the cloud's points within the radius."""
+    rows = jnp.arange(1, cloud.points.shape[0] + 1, dtype=jnp.int32)
+    return _accumulate(points, cloud, radius, largest(jnp.max(jnp.where(cloud.mask, rows, 0))))
+
+
+@_spreads.defjvp
+def _spreads_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """Reverse mode needs a loop whose length is known: over padding, too."""
+    points, cloud, radius = primals
+    moved, (cloud_moved, _), _ = tangents
+    return jax.jvp(
+        lambda points, others: _accumulate(points, cloud._replace(points=others), radius, None),
+        (points, cloud.points),
+        (moved, cloud_moved),
+    )
+
+
+def _accumulate(points: Array, cloud: Cloud, radius: Array, used: Array | None) -> Array:
+    """``_spreads``, of the first ``used`` points of the cloud, () int; of all where it is None."""
+    count = cloud.points.shape[0]
+    block = min(_BLOCK, count)
+    far = ~cloud.mask[:, None] * jnp.finfo(points.dtype).max ** 0.25
+    others = jnp.pad((cloud.points + far) / radius, ((0, -count % block), (0, 0)), constant_values=1e9)
+    others = others.reshape(-1, block, 3)
+    at = points.T / radius
+
+    def visit(sums: tuple[Array, ...], some: Array) -> tuple[Array, ...]:
+        for j in range(block):
+            x, y, z = (some[j, k] - at[k] for k in range(3))
+            near = (x**2 + y**2 + z**2 < 1).astype(points.dtype)
+            x, y, z = near * x, near * y, near * z
+            terms = near, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z
+            sums = tuple(old + term for old, term in zip(sums, terms, strict=True))
+        return sums
+
+    nothing = (jnp.zeros_like(at[0]),) * 10
+    if used is None:
+        (number, *rest), _ = jax.lax.scan(lambda sums, some: (visit(sums, some), None), nothing, others)
+    else:
+        steps = (used + block - 1) // block
+        number, *rest = jax.lax.fori_loop(0, steps, lambda step, sums: visit(sums, others[step]), nothing)
+    x, y, z, xx, xy, xz, yy, yz, zz = (each / jnp.maximum(number, 1) for each in rest)
+    xx, xy, xz, yy, yz, zz = xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z
+    return jnp.stack([jnp.stack(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
+
+
+@jax.custom_jvp
+def least_axis(spread: Array) -> Array:
+    """A unit eigenvector (3,) of the smallest eigenvalue of a symmetric matrix (3, 3) of any scale, in closed form.
+
+    The eigenvalue by Smith's trigonometric formula (1961), the vector as the longest cross product of two rows of what
+    then is singular. Where the two smallest eigenvalues agree, that vanishes, and any direction across the longest row
+    will do; z for a multiple of the identity.
+    """
+    axes = jnp.eye(3, dtype=spread.dtype)
+    largest = jnp.max(jnp.abs(spread))
+    spread = spread / jnp.where(largest > 0, largest, 1.0)
+    mean = jnp.trace(spread) / 3
+    rest = spread - mean * axes
+    size = jnp.sqrt(jnp.maximum(jnp.sum(rest**2) / 6, 1e-30))
+    rest = rest / size
+    angle = jnp.arccos(jnp.clip(jnp.linalg.det(rest) / 2, -1.0, 1.0)) / 3
+    rows = rest - 2 * jnp.cos(angle + 2 * jnp.pi / 3) * axes
+    crosses = jnp.stack([cross(rows[0], rows[1]), cross(rows[1], rows[2]), cross(rows[2], rows[0])])
+    longest = crosses[jnp.argmax(jnp.sum(crosses**2, axis=-1))]
+    row = rows[jnp.argmax(jnp.sum(rows**2, axis=-1))]
+    across = cross(row, axes[jnp.argmin(jnp.abs(row))])
+    vector = jnp.where(jnp.linalg.norm(longest) > _SINGULAR, longest, across)
+    length = jnp.linalg.norm(vector)
+    return jnp.where(length > _SINGULAR, vector / jnp.maximum(length, _SINGULAR), axes[2])
+
+
+@least_axis.defjvp
+def _least_axis_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """First-order perturbation of an eigenvector; nothing where another eigenvalue is nearly the same."""
+    (spread,), (change,) = primals, tangents
+    vector = least_axis(spread)
+    least = vector @ jnp.matmul(spread, vector, precision=_HIGHEST)
+    # In closed form in the plane across the vector: batches of LAPACK's eigh may wait for each other for ever on a CPU.
+    first = cross(vector, jnp.eye(3, dtype=vector.dtype)[jnp.argmin(jnp.abs(vector))])
+    first /= jnp.linalg.norm(first)
+    plane = jnp.stack([first, cross(vector, first)])
+    above = jnp.matmul(plane, jnp.matmul(spread, plane.T, precision=_HIGHEST), precision=_HIGHEST)
+    above -= least * jnp.eye(2, dtype=least.dtype)
+    along = jnp.matmul(plane, jnp.matmul(change, vector, precision=_HIGHEST), precision=_HIGHEST)
+    determinant = above[0, 0] * above[1, 1] - above[0, 1] * above[1, 0]
+    usable = determinant > 1e-3 * jnp.maximum(jnp.trace(above) ** 2, jnp.finfo(spread.dtype).tiny)
+    adjugate = jnp.array([[above[1, 1], -above[0, 1]], [-above[1, 0], above[0, 0]]])
+    turn = jnp.matmul(adjugate, along, precision=_HIGHEST) / jnp.where(usable, determinant, 1.0)
+    return vector, -jnp.matmul(jnp.where(usable, turn, 0.0), plane, precision=_HIGHEST)

@@ -1,1 +1,0 @@
-"""Point clouds with masks, rigid transforms and neighbour queries: the ground floor, which imports nothing above it."""

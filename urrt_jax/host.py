@@ -1,0 +1,150 @@
+"""A pair of clouds on the host: stripped of padding, in its frame, padded to a rung, and the way back.
+
+What happens here is NumPy in float64, so that a far origin (map coordinates) costs no digits.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+from urrt_jax.assessment import moved_information
+from urrt_jax.clouds import Cloud
+from urrt_jax.clouds.cloud import FARTHEST
+from urrt_jax.frames import normalize_on_host
+from urrt_jax.result import Registration
+from urrt_jax.rigid import Rigid
+from urrt_jax.stages import Outputs, Told
+
+
+class PairOnHost:
+    """One pair as NumPy arrays, in its frame, and the way back to the arrays that were given.
+
+    Attributes:
+      frame: the frame.
+      size: how many real points the larger cloud has.
+      dtype: of the arrays that the stages get: float32, or float64 where JAX arrays of it were given.
+      told: what else is known of the pair.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        target: Any,
+        source_mask: Any = None,
+        target_mask: Any = None,
+        initial: Any = None,
+        inlier_distance: Any = None,
+    ) -> None:
+        """Arguments as for ``register``, of which all but the extent of the clouds has been checked.
+
+        Raises:
+          ValueError: a cloud is too large for float32.
+        """
+        arrays = np.asarray(source), np.asarray(target)
+        masks = source_mask, target_mask
+        self._lengths = len(arrays[0]), len(arrays[1])
+        self._rows = [None if mask is None else np.flatnonzero(np.asarray(mask)) for mask in masks]
+        real = [array if rows is None else array[rows] for array, rows in zip(arrays, self._rows, strict=True)]
+        for points, name in zip(real, ("source", "target"), strict=True):
+            _refuse_far(points, name)
+        matrix: Any = np.eye(4) if initial is None else np.asarray(initial, np.float64)
+        left, _, right = np.linalg.svd(matrix[:3, :3])
+        turn: Any = left @ right  # as given, it may be rounded
+        *self._points, self.frame = normalize_on_host(real[0], real[1], Rigid(turn, matrix[:3, 3]))
+        self.size = max(map(len, real))
+        given = (each.dtype for each in (source, target) if isinstance(each, jax.Array))
+        self.dtype = np.result_type(np.float32, *given)
+        step = max(np.spacing(np.abs(points).max().astype(np.float32)) if is_short(points) else 0.0 for points in real)
+        asked = 0.0 if inlier_distance is None else float(np.asarray(inlier_distance))
+        self.told = Told(
+            begin=np.bool_(initial is not None),
+            offset=((self.frame.source_center - self.frame.target_center) / self.frame.scale).astype(self.dtype),
+            usable=np.bool_(True),
+            inlier_distance=self.dtype.type(asked / self.frame.scale),
+            grid=self.dtype.type(step / self.frame.scale),
+        )
+
+    def padded(self, size: int) -> tuple[Cloud, Cloud, Told]:
+        """Both clouds in the frame, padded to ``size`` rows, and what else is known."""
+        clouds = []
+        for points in self._points:
+            padded: Any = np.zeros((size, 3), self.dtype)
+            padded[: len(points)] = points
+            mask: Any = np.arange(size) < len(points)
+            clouds.append(Cloud(padded, mask))
+        return clouds[0], clouds[1], self.told
+
+    def restore(self, outputs: Outputs) -> Registration:
+        """The result, as NumPy arrays, in the user's frame and rows; translations and information are float64."""
+        scale, report = self.frame.scale, outputs.report
+        poses = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), (outputs.transform, outputs.coarse))
+        pose, coarse = map(self.frame.leave, poses)
+        stretch = np.array([1.0, 1.0, 1.0, scale, scale, scale])
+        matrix: Any = np.asarray(report.information, np.float64) * stretch * stretch[:, None]
+        found = report.correspondences[: len(self._points[0])]
+        if self._rows[1] is not None:
+            found = np.where(found >= 0, self._rows[1][found], -1)
+
+        def plain(value: Any) -> Any:
+            return np.asarray(value, self.dtype)
+
+        return Registration(
+            rotation=plain(pose.rotation),
+            translation=pose.translation,
+            fitness=plain(report.fitness),
+            rmse=plain(report.rmse * scale),
+            inlier_distance=plain(report.inlier_distance * scale),
+            overlap=plain(report.overlap),
+            confidence=plain(report.confidence),
+            converged=np.asarray(report.converged),  # type: ignore[arg-type]
+            outcome=np.asarray(report.outcome),  # type: ignore[arg-type]
+            correspondences=self._in_given_rows(found, 0, -1),
+            information=moved_information(matrix, np.asarray(self.frame.target_center)),
+            source_regions=self._in_given_rows(outputs.source_regions, 0, 0),
+            target_regions=self._in_given_rows(outputs.target_regions, 1, 0),
+            coarse=Rigid(plain(coarse.rotation), coarse.translation),
+            steps=np.asarray(outputs.steps),  # type: ignore[arg-type]
+        )
+
+    def _in_given_rows(self, values: Any, side: int, fill: int) -> Any:
+        """The values of the real points, (N,) int32, where these stood in the cloud as it was given."""
+        values, rows = np.asarray(values[: len(self._points[side])], np.int32), self._rows[side]
+        if rows is None:
+            return values
+        whole = np.full(self._lengths[side], fill, np.int32)
+        whole[rows] = values
+        return whole
+
+
+def abstract_pair(size: int, dtype: DTypeLike = np.float32, batch: int | None = None) -> tuple[Cloud, Cloud, Told]:
+    """What ``PairOnHost.padded`` returns, without values; of a batch, if one is asked for."""
+    lead = () if batch is None else (batch,)
+
+    def array(shape: tuple[int, ...], kind: DTypeLike) -> Any:
+        return jax.ShapeDtypeStruct((*lead, *shape), kind)
+
+    cloud = Cloud(array((size, 3), dtype), array((size,), bool))
+    return cloud, cloud, Told(array((), bool), array((3,), dtype), array((), bool), array((), dtype), array((), dtype))
+
+
+def is_exact(points: Any) -> bool:
+    """Whether these are host numbers of more digits than float32."""
+    return not isinstance(points, jax.Array) and not is_short(points)
+
+
+def is_short(points: Any) -> bool:
+    """Whether these are an array of float32 or shorter numbers."""
+    dtype = getattr(points, "dtype", None)
+    return dtype is not None and jnp.issubdtype(dtype, jnp.floating) and jnp.finfo(dtype).bits <= 32
+
+
+def _refuse_far(points: np.ndarray, name: str) -> None:
+    """Raises a ``ValueError`` where coordinates lie too far from their middle for float32 to hold their squares."""
+    extent = np.ptp(points.astype(np.float64), axis=0).max()
+    if not extent < FARTHEST:
+        raise ValueError(
+            f"{name}: the points spread over {extent:.3g}, more than the {FARTHEST:g} that float32 can hold"
+        )

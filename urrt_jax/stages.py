@@ -1,0 +1,332 @@
+"""The stages of a registration, each compiled by itself, and the ladder of sizes that they are compiled for.
+
+``register_in_frame`` is the whole way from two clouds to a result: a Python function that calls one program after
+another. On arrays it reads from each result whether a rare stage is needed, and runs (and compiles) it only then. Under
+a trace the same stages are composed, and rare ones become loops that only run for pairs which need them.
+
+Network, search and the first stage of refinement see samples of fixed size: they are compiled once, whatever the
+clouds. Only ``prepare``, ``settle``, ``assess`` and ``label`` are compiled for each rung of the ladder.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+
+from urrt_jax import prepared, refine, rigid, search
+from urrt_jax.assessment import agreement, fit, fit_samples, information, inlier_share, well_posed
+from urrt_jax.clouds import Cloud, first
+from urrt_jax.loops import where_needed
+from urrt_jax.model.encoding import Encoding
+from urrt_jax.model.network import Model, point_regions
+from urrt_jax.model.network import estimate as apply_network
+from urrt_jax.neighbors import coarser_spacing
+from urrt_jax.prepared import THINNED, Prepared, Samples, Sizes
+from urrt_jax.programs import Program
+from urrt_jax.refine import ICP, find_basin
+from urrt_jax.result import Outcome
+from urrt_jax.rigid import Rigid
+from urrt_jax.search import Found, Search
+
+STEPS_BEFORE_REFINEMENT = 2
+"""Steps of the network, at most, where refinement follows, which does the rest."""
+_SMALLEST_RUNG, _FACTOR = 256, 4
+_SAMPLE = 512  # points of the even subsample, at least
+# The fit of the plain pose on the subsample (``Fit.surfaces``) below which a search is called for. Dense clouds are
+# searched more readily, because their quick look is cheap and seldom wrong. Chosen on training shapes and bunny pairs.
+_FITS, _FITS_DENSE = -0.5, 0.2
+_COARSE_GRID, _LOST_GRID = 0.1, 1.0
+"""The step between float32 coordinates, in spacings, from which on lost digits explain a failure, and from which on no
+result is trusted: then neighbouring points have fallen together. Guesses."""
+_SEARCHED_AT_ONCE = 2  # pairs of a batch
+
+
+def rung(count: int) -> int:
+    """The number of rows to which clouds of ``count`` points are padded: 256, 1,024, 4,096 and so on, times four."""
+    size = _SMALLEST_RUNG
+    while size < count:
+        size *= _FACTOR
+    return size
+
+
+class Start(NamedTuple):
+    """Where registration begins.
+
+    Attributes:
+      transform: the network's estimate, or the user's initial transform where that fits better.
+      coarse: the network's estimate.
+      seen: the transform that the source had undergone when the network's last step saw it.
+      still: that of the target: the identity.
+      source: the network's encoding of the source.
+      target: that of the target.
+    """
+
+    transform: Rigid
+    coarse: Rigid
+    seen: Rigid
+    still: Rigid
+    source: Encoding
+    target: Encoding
+
+
+class Plan(NamedTuple):
+    """The plain pose and the rare stages that it calls for.
+
+    Attributes:
+      found: the network's pose, refined on even samples; ``pending`` where it calls for a search.
+      quick: (), bool, whether the search begins with a quick look.
+      large: (), bool, whether refinement begins among thinned clouds.
+    """
+
+    found: Found
+    quick: Array
+    large: Array
+
+
+class Report(NamedTuple):
+    """What is said of a registration, in the pair's frame: the fields of ``Registration`` with these names."""
+
+    fitness: Array
+    rmse: Array
+    inlier_distance: Array
+    overlap: Array
+    confidence: Array
+    converged: Array
+    outcome: Array
+    correspondences: Array
+    information: Array
+
+
+class Options(NamedTuple):
+    """What the user chose.
+
+    Attributes:
+      model: the network.
+      refine: how to refine; None to leave that out.
+      search: how to search; None to leave that out.
+      always: whether to search also where the plain pose is sure.
+    """
+
+    model: Model
+    refine: ICP | None
+    search: Search | None
+    always: bool | Array
+
+
+class Told(NamedTuple):
+    """What is known of a pair besides its clouds, all in the pair's frame.
+
+    Attributes:
+      begin: (), bool, whether there is an initial transform.
+      offset: (3,), the translation that is left of it in the frame, between the clouds' centroids.
+      usable: (), bool, whether it is finite.
+      inlier_distance: (), 0 for the default.
+      grid: (), the step between the coordinates that float32 could hold.
+    """
+
+    begin: Any
+    offset: Any
+    usable: Any
+    inlier_distance: Any
+    grid: Any
+
+
+class Outputs(NamedTuple):
+    """A registration in the pair's frame."""
+
+    transform: Rigid
+    coarse: Rigid
+    report: Report
+    source_regions: Array
+    target_regions: Array
+    steps: Any
+
+
+@Program
+def estimate(model: Model, source: Samples, target: Samples, told: Told) -> Start:
+    """Where registration begins, from even samples of both clouds."""
+    few = first(source.even, model.config.points), first(target.even, model.config.points)
+    answer = apply_network(model, *few)
+    nothing = rigid.identity()
+    given = Rigid(nothing.rotation, told.offset)
+    poses = jax.tree.map(lambda *leaves: jax.lax.stop_gradient(jnp.stack(leaves)), answer.transform, given)
+    scores = jax.lax.cond(
+        jnp.asarray(told.begin),
+        lambda: agreement(poses, (source.even, target.even), (source.even, target.even), coarser_spacing(*few)),
+        lambda: jnp.zeros(2, poses.translation.dtype),
+    )
+    begin = jax.tree.map(lambda own, other: jnp.where(scores[0] < scores[1], other, own), answer.transform, given)
+    return Start(begin, answer.transform, answer.seen, nothing, answer.source, answer.target)
+
+
+@Program
+def approach(
+    options: tuple[ICP, Array | bool], source: Samples, target: Samples, counts: tuple[Array, Array], start: Rigid
+) -> Plan:
+    """The plain pose, refined on even samples, and what it calls for."""
+    how, always = options
+    transform, width = find_basin(how, source.even, target.even, start)
+    glance = fit_samples(source.even, target.even, transform)
+    fewer = jnp.minimum(*counts)
+    dense = fewer >= search.DENSE
+    pending = jnp.asarray(always) | (glance.surfaces < jnp.where(dense, _FITS_DENSE, _FITS))
+    return Plan(Found(transform, jnp.zeros_like(width), width, pending), pending & dense, fewer > THINNED)
+
+
+@Program
+def assess(
+    refined: bool | Array, source: Prepared, target: Prepared, transform: Rigid, settled: Array, told: Told
+) -> Report:
+    """What is to be said of a transform."""
+    found = fit(source, target, transform, told.inlier_distance)
+    # Derivatives pass through the distances of these neighbours, which are as they are.
+    moved, nearest = rigid.apply(transform, source.cloud.points), target.cloud.points[found.nearest]
+    squared = jnp.where(jnp.isfinite(found.squared), jnp.sum((moved - nearest) ** 2, axis=-1), jnp.inf)
+    asked = jnp.asarray(told.inlier_distance, squared.dtype)
+    reach = jnp.where(asked > 0, asked, found.touching)
+    fitness, rmse = inlier_share(source.cloud.mask, squared, reach)
+    inlier = source.cloud.mask & (squared <= reach**2)
+    rows = jnp.where(inlier, target.rows[found.nearest], -1)
+    determined = well_posed(source.cloud) & well_posed(target.cloud) & jnp.all(jnp.isfinite(transform.translation))
+    confidence = jnp.where(determined & told.usable, found.confidence, 0.0)
+    sure = confidence >= 0.5
+    lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * jnp.maximum(source.spacing, target.spacing)
+    # In order of precedence; the first that holds is the outcome.
+    outcomes = {
+        Outcome.INITIAL: ~jnp.asarray(told.usable),
+        Outcome.DEGENERATE: ~determined,
+        Outcome.DIGITS: told.grid > lost,
+        Outcome.UNSETTLED: jnp.asarray(refined) & ~settled,
+        Outcome.CONVERGED: sure,
+        Outcome.AMBIGUOUS: found.surfaces >= _FITS,
+        Outcome.MISFIT: jnp.array(True),
+    }
+    outcome = jnp.select(list(outcomes.values()), [jnp.int32(each) for each in outcomes])
+    return Report(
+        fitness=fitness,
+        rmse=rmse,
+        inlier_distance=reach,
+        overlap=found.overlap,
+        confidence=confidence,
+        converged=outcome == Outcome.CONVERGED,
+        outcome=outcome,
+        correspondences=jnp.zeros_like(rows).at[source.rows].set(rows),
+        information=information(nearest, inlier),
+    )
+
+
+@Program
+def label(model: Model, cloud: Prepared, moved: Rigid, encoding: Encoding) -> Array:
+    """The region of every point (N,), in the order in which the cloud was given; 0 for padding."""
+    labels = point_regions(model, rigid.apply(moved, cloud.cloud.points), encoding, count=cloud.count)
+    return jnp.zeros_like(labels).at[cloud.rows].set(jnp.where(cloud.cloud.mask, labels, 0))
+
+
+prepare = Program(prepared.prepare)
+search_quickly = Program(search.search_quickly)
+search_thoroughly = Program(search.search_thoroughly)
+settle_thinned = Program(refine.settle_thinned)
+settle = Program(refine.settle)
+expect = Program(refine.expect)
+
+
+def register_in_frame(
+    options: Options, source: Cloud, target: Cloud, told: Told, *, batch: int | None = None, rare: bool = False
+) -> Outputs:
+    """The registration of two clouds in their frame, padded to one size.
+
+    Args:
+      options: what the user chose.
+      source: N rows.
+      target: N rows.
+      told: what else is known of the pair.
+      batch: on arrays and abstract values: how many pairs there are, where clouds and ``told`` have a leading axis. It
+        may be longer: more rows fill a batch up to the size that is compiled, and no rare stage is run for them.
+      rare: on abstract values: whether rare stages are compiled, too.
+    """
+    model, how, searching, always = options
+    mode = _mode(options, source, target, told)
+
+    def call(program: Program, *arguments: Any) -> Any:
+        return (program if batch is None else program.batched)(*arguments)
+
+    def wanted(flag: Any) -> bool:
+        """Whether a stage that leaves pairs alone which don't need it is to be called at all."""
+        return mode == "traced" or (rare if mode == "abstract" else bool(np.any(flag)))
+
+    def when(needed: Any, program: Program, arguments: tuple, otherwise: Any) -> Any:
+        """The program's answer for the pairs that need it."""
+        if mode == "traced":
+            # As a list: JAX puts flags in place of leaves, which the checks of Search would refuse.
+            leaves, tree = jax.tree.flatten(arguments)
+            inner = lambda leaves: program(*jax.tree.unflatten(tree, leaves))  # noqa: E731
+            return where_needed(needed, inner, leaves, otherwise, at_once=_SEARCHED_AT_ONCE)
+        if not wanted(needed):
+            return otherwise
+        if batch is None:
+            return program(*arguments)
+        return _one_by_one(np.asarray(needed)[:batch], program, arguments, otherwise)
+
+    refiner = ICP() if how is None else how
+    sizes = sizes_of(options)
+    clouds = call(prepare, sizes, source), call(prepare, sizes, target)
+    samples = clouds[0].samples, clouds[1].samples
+    start = call(estimate, model, *samples, told)
+    pose, settled, steps = start.transform, told.usable, np.int32(0)
+    if how is not None or searching is not None:
+        counts = clouds[0].count, clouds[1].count
+        found, quick, large = call(approach, (refiner, always), *samples, counts, start.transform)
+        if searching is not None:
+            found = when(quick, search_quickly, (searching, *samples, found), found)
+            found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
+            pose = found.transform
+    if how is not None:
+        pose, width = found.transform, found.width
+        if wanted(large):
+            pose, width = call(settle_thinned, how, *clouds, pose, width)
+        end = last = call(settle, how, *clouds, pose, width)
+        if wanted(end.sparse):
+            last = call(expect, how, *clouds, end)
+        pose, settled, steps = last.transform, last.converged, last.iterations
+        if mode == "traced":
+            pose = refine.differentiable_pose(how, *clouds, end, last)
+    report = call(assess, how is not None, *clouds, pose, settled, told)
+    return Outputs(
+        transform=pose,
+        coarse=start.coarse,
+        report=report,
+        source_regions=call(label, model, clouds[0], start.seen, start.source),
+        target_regions=call(label, model, clouds[1], start.still, start.target),
+        steps=steps,
+    )
+
+
+def sizes_of(options: Options) -> Sizes:
+    """What ``prepare`` is told."""
+    refiner = ICP() if options.refine is None else options.refine
+    return Sizes(
+        sample=max(_SAMPLE, options.model.config.points, 2 * refiner.coarse_points),
+        queries=refiner.points,
+        normal_radius=refiner.normal_radius,
+    )
+
+
+def _mode(*arguments: Any) -> Literal["traced", "abstract", "concrete"]:
+    leaves = jax.tree.leaves(arguments)
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
+        return "traced"
+    return "abstract" if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves) else "concrete"
+
+
+def _one_by_one(needed: np.ndarray, program: Program, arguments: tuple, otherwise: Any) -> Any:
+    """The program's answers for the pairs of a batch (B,) that need it, the first argument shared by all."""
+    shared, *each = arguments
+    host, answers = jax.tree.map(np.asarray, each), jax.tree.map(np.array, otherwise)
+    for row in np.flatnonzero(needed):
+        answer = program(shared, *jax.tree.map(lambda leaf, row=row: leaf[row], host))
+        for leaf, new in zip(jax.tree.leaves(answers), jax.tree.leaves(answer), strict=True):
+            leaf[row] = new
+    return answers
