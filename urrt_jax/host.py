@@ -81,7 +81,7 @@ class PairOnHost:
         """The result, as NumPy arrays, in the user's frame and rows; translations and information are float64."""
         scale, report = self.frame.scale, outputs.report
         poses = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), (outputs.transform, outputs.coarse))
-        pose, coarse = map(self.frame.leave, poses)
+        pose, coarse = (self._rounded(self.frame.leave(each)) for each in poses)
         stretch = np.array([1.0, 1.0, 1.0, scale, scale, scale])
         matrix: Any = np.asarray(report.information, np.float64) * stretch * stretch[:, None]
         found = report.correspondences[: len(self._points[0])]
@@ -92,7 +92,7 @@ class PairOnHost:
             return np.asarray(value, self.dtype)
 
         return Registration(
-            rotation=plain(pose.rotation),
+            rotation=pose.rotation,
             translation=pose.translation,
             fitness=plain(report.fitness),
             rmse=plain(report.rmse * scale),
@@ -105,9 +105,18 @@ class PairOnHost:
             information=moved_information(matrix, np.asarray(self.frame.target_center)),
             source_regions=self._in_given_rows(outputs.source_regions, 0, 0),
             target_regions=self._in_given_rows(outputs.target_regions, 1, 0),
-            coarse=Rigid(plain(coarse.rotation), coarse.translation),
+            coarse=coarse,
             steps=np.asarray(outputs.steps),  # type: ignore[arg-type]
         )
+
+    def _rounded(self, pose: Rigid) -> Rigid:
+        """The transform with a rotation of the given dtype, which carries the source's centroid to the same place.
+
+        Far from the origin the translation has to be that of the rounded rotation.
+        """
+        rough, turn = self.frame.rough, np.asarray(pose.rotation, self.dtype)
+        centroid = rough.rotation.T @ (self.frame.source_center - rough.translation)
+        return Rigid(turn, pose.translation + (pose.rotation - turn.astype(np.float64)) @ centroid)  # type: ignore[arg-type]
 
     def _in_given_rows(self, values: Any, side: int, fill: int) -> Any:
         """The values of the real points, (N,) int32, where these stood in the cloud as it was given."""

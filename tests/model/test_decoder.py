@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from urrt_jax import rigid
+from urrt_jax import frames, rigid
 from urrt_jax.clouds import make_cloud
-from urrt_jax.frames import normalize_pair
 from urrt_jax.model import estimate, init_model
 from urrt_jax.model.decoder import fusion_weights
 from urrt_jax.model.landmarks import (
@@ -26,6 +25,7 @@ from urrt_jax.model.pose import fuse_poses
 
 _HASTY = {"xla_backend_optimization_level": 0}  # compiling takes far longer than running
 _estimate = jax.jit(estimate, compiler_options=_HASTY)
+_normalize_pair = jax.jit(frames.normalize_pair)
 
 
 def _close(first, second, atol=1e-5):
@@ -61,12 +61,12 @@ def _shapes() -> dict[str, np.ndarray]:
 def test_aligned_clouds_stay_where_they_are(one_step, name, seed):
     """Whatever the parameters: equal clouds have equal landmarks, so the truth is a fixed point."""
     points = _shapes()[name].astype(np.float32)
-    source, target, _ = normalize_pair(make_cloud(points), make_cloud(points[::-1].copy()))
+    source, target, _ = _normalize_pair(make_cloud(points), make_cloud(points[::-1].copy()))
     _close(_estimate(one_step(seed), source, target).transform, rigid.identity(), atol=1e-4)
 
 
 def test_swapped_clouds_give_the_inverse(one_step, turned, x64):
-    source, target, _ = normalize_pair(*map(make_cloud, turned))
+    source, target, _ = _normalize_pair(*map(make_cloud, turned))
     there, back = (_estimate(one_step(0), *pair).transform for pair in ((source, target), (target, source)))
     assert float(rigid.rotation_angle(there.rotation, jnp.eye(3))) > 0.01
     _close(rigid.compose(there, back), rigid.identity(), atol=1e-9)
@@ -145,7 +145,7 @@ def test_landmarks_of_equal_surroundings_are_matched_from_any_pose(small_config,
         decoder[part][layer] = jax.tree.map(lambda leaf, by=factor: by * leaf, decoder[part][layer])
     points = np.random.default_rng(0).normal(size=(200, 3)) * [1.0, 0.7, 0.4]
     turn = Rotation.from_rotvec([0.5, -0.9, 0.4]).as_matrix()
-    source, target, _ = normalize_pair(
+    source, target, _ = _normalize_pair(
         make_cloud(points.astype(np.float32)), make_cloud((points @ turn.T)[::-1].astype(np.float32))
     )
     found = _estimate(model, source, target).transform
@@ -154,7 +154,7 @@ def test_landmarks_of_equal_surroundings_are_matched_from_any_pose(small_config,
 
 def test_untrained_pose_decoders_hardly_move_anything(small_config, turned):
     model = init_model(jax.random.key(0), dataclasses.replace(small_config, decoder="pose"))
-    source, target, _ = normalize_pair(*map(make_cloud, turned))
+    source, target, _ = _normalize_pair(*map(make_cloud, turned))
     assert float(rigid.rotation_angle(_estimate(model, source, target).transform.rotation, jnp.eye(3))) < 0.3
 
 

@@ -10,7 +10,7 @@ from urrt_jax.rigid import cross
 
 _BLOCK = 8
 _HIGHEST = jax.lax.Precision.HIGHEST
-_SINGULAR = 1e-4  # what rounding leaves of a cross product of rows of size 1 that should vanish
+_SINGULAR = 2e-3  # what rounding, of which arccos makes its root, leaves of a cross product that should vanish
 
 
 def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array) -> Array:
