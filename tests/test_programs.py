@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from urrt_jax import program_cache
 from urrt_jax.programs import Program, clear_programs, use_compilation_cache, wait_until_ready
@@ -78,24 +79,27 @@ def compilations() -> Iterator[list[str]]:
 
 @pytest.fixture(autouse=True)
 def _fresh_process(monkeypatch):
+    """As in a process of its own, without JAX's own cache, which the tests share: what it holds is not kept again."""
     monkeypatch.setattr(program_cache, "_cache", None)
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    shared = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
     clear_programs()
     yield
+    jax.config.update("jax_compilation_cache_dir", shared)
+    compilation_cache.reset_cache()
     with contextlib.suppress(Exception):
         wait_until_ready()
     clear_programs()
 
 
 @pytest.fixture
-def folder(tmp_path) -> Iterator[Path]:
-    """An empty cache in use; JAX's own, which the tests share, doesn't keep the programs."""
-    name = "jax_persistent_cache_min_compile_time_secs"
-    before = jax.config.values[name]
-    jax.config.update(name, 1e6)
+def folder(tmp_path) -> Path:
+    """An empty cache in use."""
     folder = tmp_path / "programs"
     assert use_compilation_cache(folder) == folder
-    yield folder
-    jax.config.update(name, before)
+    return folder
 
 
 def entries(folder: Path) -> list[Path]:

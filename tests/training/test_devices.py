@@ -35,7 +35,8 @@ _STEP = """
 
 def first_step(devices: int) -> dict:
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    environment = os.environ | {"XLA_FLAGS": flags}
+    # In double precision, because devices add up in different orders, and gradients multiply that rounding.
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
     command = [sys.executable, "-c", textwrap.dedent(_STEP)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
