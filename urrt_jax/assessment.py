@@ -12,7 +12,7 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, first, thin
 from urrt_jax.clouds.normals import least_axis
 from urrt_jax.neighbors import Blocks, Neighbors, coarser_spacing, nearest
-from urrt_jax.prepared import Prepared
+from urrt_jax.prepared import Prepared, coarser
 from urrt_jax.rigid import Rigid, cross, nearest_rotation
 
 _HIGHEST = jax.lax.Precision.HIGHEST
@@ -85,7 +85,7 @@ def fit(source: Prepared, target: Prepared, transform: Rigid, reach: Array | flo
       reach: (), neighbours of source points are looked for within 3 spacings of the coarser cloud, or within this.
     """
     source, target, transform = jax.lax.stop_gradient((source, target, transform))
-    width = jnp.maximum(source.spacing, target.spacing)
+    width = coarser(source, target)
     reaches = jnp.stack([jax.lax.stop_gradient(jnp.asarray(reach, width.dtype)), jnp.zeros_like(width)])
     queries = source.cloud, first(target.samples.thinned, source.cloud.mask.shape[0])
     found, shares = _look(

@@ -89,6 +89,11 @@ def prepare(sizes: Sizes, cloud: Cloud) -> Prepared:
     )
 
 
+def coarser(source: Prepared, target: Prepared) -> Array:
+    """The spacing, (), of the coarser one of two clouds."""
+    return jnp.maximum(source.spacing, target.spacing)
+
+
 def thinned_spacing(count: Array, width: Array) -> Array:
     """The spacing, (), of a thinned cloud: on a surface, it grows as the square root of the points left out.
 

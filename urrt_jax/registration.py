@@ -63,9 +63,9 @@ def register(
       refine: how to refine, after at most two of the network's steps; None returns the network's estimate after all of
         them, or the search's.
       search: how to look for the pose among all poses. "auto" searches only where the network's estimate, refined on a
-        subsample of 512 points, does not fit: a pair that needs no search pays about a millisecond for that look, one
-        that does pays some 50 to 200 ms. It does nothing where ``refine`` is None. A ``Search`` always searches; None
-        never does. Among poses that fit alike the network's stays.
+        subsample of 512 points, does not fit. That look costs little; a search takes as long as the rest together, and
+        much longer where it must be compiled first. "auto" does nothing where ``refine`` is None. A ``Search`` always
+        searches; None never does. Among poses that fit alike the network's stays.
       initial: (4, 4), a rough transform from source to target where one is known, as from odometry or a turntable: the
         network and the search begin with the source moved by it, and largest angles count from it. No derivative
         passes to it.

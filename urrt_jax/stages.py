@@ -193,7 +193,7 @@ def assess(
     determined = well_posed(source.cloud) & well_posed(target.cloud) & jnp.all(jnp.isfinite(transform.translation))
     confidence = jnp.where(determined & told.usable, found.confidence, 0.0)
     sure = confidence >= 0.5
-    lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * jnp.maximum(source.spacing, target.spacing)
+    lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * prepared.coarser(source, target)
     # In order of precedence; the first that holds is the outcome.
     outcomes = {
         Outcome.INITIAL: ~jnp.asarray(told.usable),
@@ -253,19 +253,21 @@ def register_in_frame(
     def call(program: Program, *arguments: Any) -> Any:
         return (program if batch is None else program.batched)(*arguments)
 
-    def wanted(flag: Any) -> bool:
-        """Whether a stage that leaves pairs alone which don't need it is to be called at all."""
-        return mode == "traced" or (rare if mode == "abstract" else bool(np.any(flag)))
+    def wanted(flag: Any, least: int = 0) -> bool:
+        """Whether a stage is to be called at all that some pairs need, none of them of fewer than ``least`` points."""
+        if mode == "traced":
+            return source.mask.shape[-1] >= least
+        return rare if mode == "abstract" else bool(np.any(flag))
 
-    def when(needed: Any, program: Program, arguments: tuple, otherwise: Any) -> Any:
+    def when(needed: Any, program: Program, arguments: tuple, otherwise: Any, least: int = 0) -> Any:
         """The program's answer for the pairs that need it."""
+        if not wanted(needed, least):
+            return otherwise
         if mode == "traced":
             # As a list: JAX puts flags in place of leaves, which the checks of Search would refuse.
             leaves, tree = jax.tree.flatten(arguments)
             inner = lambda leaves: program(*jax.tree.unflatten(tree, leaves))  # noqa: E731
             return where_needed(needed, inner, leaves, otherwise, at_once=_SEARCHED_AT_ONCE)
-        if not wanted(needed):
-            return otherwise
         if batch is None:
             return program(*arguments)
         return _one_by_one(np.asarray(needed)[:batch], program, arguments, otherwise)
@@ -280,12 +282,12 @@ def register_in_frame(
         counts = clouds[0].count, clouds[1].count
         found, quick, large = call(approach, (refiner, always), *samples, counts, start.transform)
         if searching is not None:
-            found = when(quick, search_quickly, (searching, *samples, found), found)
+            found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
             pose = found.transform
     if how is not None:
         pose, width = found.transform, found.width
-        if wanted(large):
+        if wanted(large, least=THINNED + 1):
             pose, width = call(settle_thinned, how, *clouds, pose, width)
         end = last = call(settle, how, *clouds, pose, width)
         if wanted(end.sparse):

@@ -16,8 +16,7 @@ from jax import Array
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, centroid, first, normals
 from urrt_jax.loops import where_needed, while_each
-from urrt_jax.neighbors import LEAST_SPACING
-from urrt_jax.prepared import Prepared
+from urrt_jax.prepared import Prepared, coarser
 from urrt_jax.refine.config import ICP
 from urrt_jax.refine.icp import Settled
 from urrt_jax.refine.solver import accumulate, bounded_step, move, root_at_zero, small_step
@@ -134,7 +133,7 @@ def expected_pose(refine: ICP, source: Prepared, target: Prepared, start: Rigid,
 def _whole(refine: ICP, source: Prepared, target: Prepared) -> tuple[tuple[Cloud, Cloud], Array]:
     """Both clouds, padded no further than EM-ICP takes them, and the coarser spacing."""
     size = min(source.cloud.mask.shape[0], max(refine.em_points, 3))
-    unit = jnp.maximum(jnp.maximum(source.spacing, target.spacing), LEAST_SPACING)
+    unit = coarser(source, target)  # never 0
     return (first(source.cloud, size), first(target.cloud, size)), unit
 
 

@@ -18,7 +18,7 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, first
 from urrt_jax.loops import while_each
 from urrt_jax.neighbors import LEAST_SPACING, nearest, spacing
-from urrt_jax.prepared import THINNED, Prepared, thinned_spacing
+from urrt_jax.prepared import THINNED, Prepared, coarser, thinned_spacing
 from urrt_jax.refine.config import ICP
 from urrt_jax.refine.pairs import Pairs, Surface, both, find_pairs, pair_up, robust_weights
 from urrt_jax.refine.solver import bounded_step, move, normal_equations, root_at_zero, small_step
@@ -133,7 +133,7 @@ def settle_thinned(refine: ICP, source: Prepared, target: Prepared, start: Rigid
     end = _iterate(
         refine, rough, start, width, unit, _ROUGHLY * refine.tolerance, jnp.where(large, refine.iterations // 2, 0)
     )
-    return end.transform, jnp.where(large, refine.inlier_distance * _coarser(source, target), width)
+    return end.transform, jnp.where(large, refine.inlier_distance * coarser(source, target), width)
 
 
 def settle(refine: ICP, source: Prepared, target: Prepared, start: Rigid, width: Array) -> Settled:
@@ -147,7 +147,7 @@ def settle(refine: ICP, source: Prepared, target: Prepared, start: Rigid, width:
       width: (), the first width of the weights.
     """
     surfaces = jax.lax.stop_gradient(both(_surface(source), _surface(target)))
-    unit = jax.lax.stop_gradient(_coarser(source, target))
+    unit = jax.lax.stop_gradient(coarser(source, target))
     floor = refine.inlier_distance * unit
     end = _iterate(refine, surfaces, start, width, unit, refine.tolerance, refine.iterations)
     small = jnp.maximum(source.count, target.count) <= refine.em_points
@@ -161,7 +161,7 @@ def settled_pose(refine: ICP, source: Prepared, target: Prepared, end: Settled) 
     They are exact while correspondences and neighbourhoods hold (implicit function theorem). A normal of fewer than
     three neighbours has no meaning and counts as fixed.
     """
-    surfaces, floor = both(_surface(source), _surface(target)), refine.inlier_distance * _coarser(source, target)
+    surfaces, floor = both(_surface(source), _surface(target)), refine.inlier_distance * coarser(source, target)
     end = jax.lax.stop_gradient(end)
     pairs = find_pairs(jax.lax.stop_gradient(surfaces), end.transform, _SEEN * end.width)
     counted = jnp.isfinite(pairs.squared)
@@ -219,10 +219,6 @@ def _squared_width(squared: Array, weights: Array, widest: Array) -> Array:
     distances = jnp.where(weights > 0, squared, 0.0)  # infinite, where there is no correspondence
     mean = jnp.sum(weights * distances) / jnp.maximum(jnp.sum(weights), 1e-9)
     return jnp.clip(_SPREADS**2 * mean, (_NARROWEST * widest) ** 2, widest**2)
-
-
-def _coarser(source: Prepared, target: Prepared) -> Array:
-    return jnp.maximum(source.spacing, target.spacing)
 
 
 def _surface(cloud: Prepared) -> Surface:
