@@ -232,7 +232,7 @@ def test_the_first_call_asks_for_common_stages_before_it_runs_any(pairs, small_m
         return real(options, source, target, told, **flags)
 
     monkeypatch.setattr("urrt_jax.registration.register_in_frame", watched)
-    monkeypatch.setattr("urrt_jax.registration._asked_for", set())
+    monkeypatch.setattr("urrt_jax.programs._compiled_ahead", set())
     for _ in range(2):
         register(pairs[0][0], pairs[1][0], model=small_model)
     assert seen == [jax.ShapeDtypeStruct, np.ndarray, np.ndarray]

@@ -60,7 +60,9 @@ def _loss(parameters, pairs, through_pose):
 @pytest.fixture(scope="module")
 def value_and_grad(pairs):
     """A function of (parameters, through_pose): the loss and its gradient."""
-    compiled = jax.jit(jax.value_and_grad(_loss))
+    # It runs for minutes when it is compiled as hastily as other tests are (conftest.py).
+    fast = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+    compiled = jax.jit(jax.value_and_grad(_loss), compiler_options=fast)
     return lambda parameters, through_pose: compiled(jnp.array(parameters), pairs, through_pose)
 
 

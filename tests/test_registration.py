@@ -6,6 +6,7 @@ searches, since a search takes long to compile into a program (``test_stages.py`
 """
 
 import dataclasses
+import os
 import subprocess
 import sys
 import textwrap
@@ -191,7 +192,6 @@ def test_a_rough_transform_that_lies_better_than_the_network_s_estimate_is_refin
     assert bool(found.converged)
 
 
-@pytest.mark.xfail(strict=True, reason="the search prefers a pose in which more points touch to the one that is sure")
 def test_a_rough_transform_that_lies_better_is_refined_beside_an_automatic_search(call, cloud):
     source, target = cloud[cloud[:, 0] < 0.55], cloud[cloud[:, 0] > -0.25]
     rough = np.eye(4)
@@ -901,9 +901,10 @@ _LARGE = """
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak memory from Linux's /proc")
 def test_two_clouds_of_a_million_points_take_less_than_three_gibibytes():
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(_LARGE)], capture_output=True, text=True, timeout=300, check=False
-    )
+    # Without the flags of conftest.py, with which programs compile quickly and run slowly.
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    command = [sys.executable, "-c", textwrap.dedent(_LARGE)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert int(done.stdout) * 1024 < 3 * 2**30
 

@@ -28,6 +28,7 @@ ASSESSED = {"overlap": 3.0, "tightness": 4.0, "closeness": 4.2, "uniqueness": 8.
 
 ``experiments/confidence`` fits it again and measures these on test shapes and scans."""
 BIAS = -9.5
+_SURFACES = np.array([ASSESSED[name] for name in ("overlap", "tightness", "closeness")], np.float32)
 
 
 class Fit(NamedTuple):
@@ -64,10 +65,14 @@ class Fit(NamedTuple):
         return jnp.stack([jnp.max(self.overlap), tightness, closeness, self.uniqueness])
 
     @property
+    def score(self) -> Array:
+        """(), in [0, 1]: the evidence that surfaces lie on each other, weighed as the confidence does; 1 at best."""
+        return self.evidence[:3] @ _SURFACES / _SURFACES.sum()
+
+    @property
     def surfaces(self) -> Array:
         """(), the logit of the confidence less what the uniqueness adds: how well the surfaces lie on each other."""
-        weights = jnp.array([ASSESSED[name] for name in ("overlap", "tightness", "closeness")])
-        return BIAS + self.evidence[:3] @ weights
+        return BIAS + _SURFACES.sum() * self.score
 
     @property
     def confidence(self) -> Array:
@@ -96,19 +101,27 @@ def fit(source: Prepared, target: Prepared, transform: Rigid, reach: Array | flo
         for count in (_TURNED, _TURNED_QUERIES)
     )
     far = jnp.where(source.cloud.mask, found.squared[0], jnp.inf)
-    return Fit(found.index[0], far, _RINGS[_TOUCHING] * width, shares, _uniqueness(clouds, asked, transform))
+    uniqueness = _uniqueness(clouds, asked, transform, coarser_spacing(*clouds))
+    return Fit(found.index[0], far, _RINGS[_TOUCHING] * width, shares, uniqueness)
 
 
-def fit_samples(source: Cloud, target: Cloud, transform: Rigid) -> Fit:
-    """The fit of even samples of both clouds (``subsample``), of one size, which is quick. Arguments as for ``fit``."""
-    source, target, transform = jax.lax.stop_gradient((source, target, transform))
+def fit_samples(source: Cloud, target: Cloud, transform: Rigid, width: Array) -> Fit:
+    """The fit of even samples (``subsample``), which is quick; no derivative passes.
+
+    Args:
+      source: N points.
+      target: N points.
+      transform: source to target.
+      width: (), the spacing of the coarser sample.
+    """
+    source, target, transform, width = jax.lax.stop_gradient((source, target, transform, width))
     clouds = source, target
-    width = coarser_spacing(*clouds)
     found, shares = _look(clouds, clouds, transform, width, jnp.zeros(2, width.dtype))
     # The first points of a farthest-point sample are an even sample, too.
     asked = first(source, _TURNED_QUERIES), first(target, _TURNED_QUERIES)
     far = jnp.where(source.mask, found.squared[0], jnp.inf)
-    return Fit(found.index[0], far, _RINGS[_TOUCHING] * width, shares, _uniqueness(clouds, asked, transform))
+    uniqueness = _uniqueness(clouds, asked, transform, width)
+    return Fit(found.index[0], far, _RINGS[_TOUCHING] * width, shares, uniqueness)
 
 
 def _look(
@@ -119,7 +132,7 @@ def _look(
     reaches: Array,
     *blocks: Blocks | None,
 ) -> tuple[Neighbors, Array]:
-    """The neighbours of either cloud's queries in the other cloud (2, Q), and how many lie within each ring, (2, 3)."""
+    """The neighbours of either cloud's queries in the other cloud (2, Q), and the share within each ring, (2, 3)."""
     rings = width * jnp.array(_RINGS, width.dtype)
     within = _BEYOND * jnp.maximum(rings[_ABOUT], reaches)
     points = rigid.apply(transform, queries[0].points), rigid.apply(rigid.inverse(transform), queries[1].points)
@@ -142,7 +155,7 @@ def _look(
     return found, jnp.sum(near, axis=1) / jnp.maximum(jnp.sum(masks, axis=1), 1)[:, None]
 
 
-def _uniqueness(clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...], transform: Rigid) -> Array:
+def _uniqueness(clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...], transform: Rigid, width: Array) -> Array:
     """By how much the agreement after ``transform`` exceeds that after further turns, (), from -1 to 1.
 
     A shape is mistaken for itself turned by a half or a quarter about an axis of symmetry, exact or nearly so, which is
@@ -160,7 +173,7 @@ def _uniqueness(clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...], transform: 
     rotations = jnp.concatenate([jnp.eye(3)[None], turned])
     turns = Rigid(rotations, centre - rigid.rotate(rotations, centre))
     poses = jax.vmap(lambda turn: rigid.compose(turn, transform))(turns)
-    agreements = agreement(poses, clouds, asked, coarser_spacing(*clouds))
+    agreements = agreement(poses, clouds, asked, width)
     return agreements[0] - jnp.max(agreements[1:])
 
 

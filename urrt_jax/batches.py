@@ -15,7 +15,7 @@ from urrt_jax.clouds import check_cloud
 from urrt_jax.host import PairOnHost
 from urrt_jax.model.network import Model
 from urrt_jax.refine import ICP
-from urrt_jax.registration import check_options, check_rigid, compile_ahead, make_options, register_on_host
+from urrt_jax.registration import check_options, check_rigid, make_options, register_on_host, start_compiling
 from urrt_jax.result import Outcome, Registration
 from urrt_jax.rigid import Rigid
 from urrt_jax.search import Search
@@ -210,7 +210,7 @@ def _check_pair(source: Any, target: Any, initial: Any, inlier_distance: float |
 
 def _register_batch(options: Options, pairs: list[PairOnHost], size: int, batch: int) -> Iterator[Registration]:
     """The results of at most ``batch`` pairs of one rung."""
-    compile_ahead(options, size, pairs[0].dtype, batch)
+    start_compiling(options, size, pairs[0].dtype, batch)
     # Copies fill the batch up, so that one program serves all.
     padded = [pair.padded(size) for pair in pairs + pairs[-1:] * (batch - len(pairs))]
     source, target, told = jax.tree.map(lambda *leaves: np.stack(leaves), *padded)

@@ -1,7 +1,7 @@
 """The frame in which a pair is registered: both clouds about their centroids, in units of their common radius.
 
-The source is moved by a rough transform first, where one is known. A ``Frame`` is invertible, and the only way between
-the user's coordinates and those of the network, refinement and search.
+The source is moved by a rough transform first, where one is known. Network, refinement and search see this frame alone.
+A ``Frame`` is invertible: poses enter and leave through it, and its ``scale`` turns lengths into the input's units.
 """
 
 from typing import Any, NamedTuple

@@ -25,7 +25,7 @@ class PairOnHost:
     Attributes:
       frame: the frame.
       size: how many real points the larger cloud has.
-      dtype: of the arrays that the stages get: float32, or float64 where JAX arrays of it were given.
+      dtype: of the arrays that the stages get: float32, unless JAX arrays of float64 were given.
       told: what else is known of the pair.
     """
 
@@ -56,13 +56,13 @@ class PairOnHost:
         *self._points, self.frame = normalize_on_host(real[0], real[1], Rigid(turn, matrix[:3, 3]))
         self.size = max(map(len, real))
         given = (each.dtype for each in (source, target) if isinstance(each, jax.Array))
-        self.dtype = np.result_type(np.float32, *given)
+        self.dtype = np.dtype(np.float64 if any(each == np.float64 for each in given) else np.float32)
         step = max(np.spacing(np.abs(points).max().astype(np.float32)) if is_short(points) else 0.0 for points in real)
         asked = 0.0 if inlier_distance is None else float(np.asarray(inlier_distance))
         self.told = Told(
-            begin=np.bool_(initial is not None),
+            has_initial=np.bool_(initial is not None),
             offset=((self.frame.source_center - self.frame.target_center) / self.frame.scale).astype(self.dtype),
-            usable=np.bool_(True),
+            initial_is_finite=np.bool_(True),
             inlier_distance=self.dtype.type(asked / self.frame.scale),
             grid=self.dtype.type(step / self.frame.scale),
         )

@@ -30,7 +30,7 @@ def while_each(
       step: of the context and the state; closes over no traced value.
       start: state, a pytree of arrays.
       context: what stays the same, a pytree of arrays.
-      at_once: problems worked on at a time under ``vmap``; by default from 16 to 256, as the batch is large.
+      at_once: problems worked on at a time under ``vmap``; by default from 16 to 256, growing with the batch.
     """
 
     @custom_vmap
@@ -57,7 +57,7 @@ def where_needed(
 ) -> Any:
     """``function(operands)`` where ``needed``, else ``otherwise``, of the same structure; no derivative passes.
 
-    This is ``jax.lax.cond``, except under ``vmap``: there a plain ``cond`` evaluates both branches for the whole batch.
+    It acts like ``jax.lax.cond``, except under ``vmap``: a plain ``cond`` evaluates both branches for the whole batch.
     Here pairs that don't need the function cost next to nothing.
 
     Args:

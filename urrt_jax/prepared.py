@@ -36,10 +36,12 @@ class Samples(NamedTuple):
 
     Attributes:
       even: an even subsample, farthest points first (``subsample``).
+      spacing: (), the even subsample's resolution (``neighbors.spacing``), never 0.
       thinned: at most ``THINNED`` points whose density follows the cloud's, along the curve (``thin``).
     """
 
     even: Cloud
+    spacing: Array
     thinned: Cloud
 
 
@@ -77,28 +79,30 @@ def prepare(sizes: Sizes, cloud: Cloud) -> Prepared:
     width = jnp.maximum(spacing(cloud, blocks=blocks, sample=measured), LEAST_SPACING)
     thinned, queries = (thin(cloud, size, ordered=True) for size in (THINNED, sizes.queries))
     radius = sizes.normal_radius * thinned_spacing(count, width)
+    even = subsample(thinned, sizes.sample)
     return Prepared(
         cloud=cloud,
         rows=rows,
         count=count,
         blocks=blocks,
         spacing=width,
-        samples=Samples(subsample(thinned, sizes.sample), first(thinned, THINNED)),
+        samples=Samples(even, jnp.maximum(spacing(even), LEAST_SPACING), first(thinned, THINNED)),
         queries=queries,
         normals=normals(queries.points, thinned, radius, centroid(cloud)),
     )
 
 
-def coarser(source: Prepared, target: Prepared) -> Array:
-    """The spacing, (), of the coarser one of two clouds."""
+def coarser(source: Prepared | Samples, target: Prepared | Samples) -> Array:
+    """The spacing, (), of the coarser one of two clouds, or of the coarser one of their even subsamples."""
     return jnp.maximum(source.spacing, target.spacing)
 
 
-def thinned_spacing(count: Array, width: Array) -> Array:
+def thinned_spacing(count: Array, width: Array, kept: int = THINNED) -> Array:
     """The spacing, (), of a thinned cloud: on a surface, it grows as the square root of the points left out.
 
     Args:
       count: (), points of the whole cloud.
       width: (), the spacing of the whole cloud.
+      kept: how many points the thinned cloud has, at most.
     """
-    return width * jnp.sqrt(jnp.maximum(1.0, count / THINNED))
+    return width * jnp.sqrt(jnp.maximum(1.0, count / kept))

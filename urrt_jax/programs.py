@@ -7,7 +7,7 @@ of its programs; on arrays it runs them; under ``jax.jit``, ``jax.grad`` or ``ja
 import functools
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent import futures
 from typing import Any, NamedTuple
 
@@ -19,7 +19,14 @@ from tqdm import tqdm
 
 from urrt_jax.program_cache import compile_and_keep, entry_key, load_program, use_compilation_cache
 
-__all__ = ["Program", "clear_programs", "is_debugging", "use_compilation_cache", "wait_until_ready"]
+__all__ = [
+    "Program",
+    "clear_programs",
+    "compile_ahead",
+    "is_debugging",
+    "use_compilation_cache",
+    "wait_until_ready",
+]
 
 # XLA runs a part of each compilation in threads of its own; more at once gain little and take memory. A guess.
 _COMPILED_AT_ONCE = 2
@@ -58,6 +65,7 @@ class _Compilation:
 _lock = threading.Lock()
 _compilations: dict[tuple, _Compilation] = {}
 _in_background: list[_Compilation] = []
+_compiled_ahead: set[Hashable] = set()
 _slots = threading.Semaphore(_COMPILED_AT_ONCE)
 
 
@@ -212,6 +220,13 @@ def wait_until_ready(progress: bool = False) -> None:
         compilation.executable.result()
 
 
+def compile_ahead(key: Hashable, call: Callable[[], Any]) -> None:
+    """Calls ``call``, which calls programs with abstract values, unless it was called with this key before."""
+    if key not in _compiled_ahead and not is_debugging():
+        call()
+        _compiled_ahead.add(key)
+
+
 def is_debugging() -> bool:
     """Whether a setting of JAX for debugging is on, under which programs on arrays are not compiled ahead of time."""
     return any(map(_setting, _DEBUGGING))
@@ -222,6 +237,7 @@ def clear_programs() -> None:
     with _lock:
         _compilations.clear()
         _in_background.clear()
+        _compiled_ahead.clear()
 
 
 def _run_in_background(compilation: _Compilation, key: tuple, finish: Callable[[], None]) -> None:

@@ -16,7 +16,7 @@ from urrt_jax.clouds import Cloud, check_cloud, first, make_cloud
 from urrt_jax.frames import Frame, normalize_pair
 from urrt_jax.host import PairOnHost, abstract_pair, is_exact
 from urrt_jax.model.network import Model
-from urrt_jax.programs import is_debugging
+from urrt_jax.programs import compile_ahead
 from urrt_jax.refine import ICP
 from urrt_jax.result import Registration
 from urrt_jax.rigid import Rigid
@@ -24,6 +24,7 @@ from urrt_jax.search import Search
 from urrt_jax.stages import STEPS_BEFORE_REFINEMENT, Options, Outputs, Told, register_in_frame, rung
 from urrt_jax.weights import load_model
 
+_AUTO_PREFERENCE = 0.2  # chosen on training shapes, cropped and noisy ones among them, and on bunny pairs
 _UNEVEN = 1e-3  # what the entries of R Rᵀ may be off the identity's
 
 
@@ -41,12 +42,13 @@ def register(
 ) -> Registration:
     """The rigid transform that carries ``source`` onto ``target``: ``target ≈ R @ source + t``.
 
-    The 3D-URRT network estimates it from a subsample of both clouds, centred and scaled together; a search over all
-    poses takes over where that does not fit; refinement makes it exact on the full clouds. The rotation is the same for
-    any common unit and any origin of either cloud. A pure function: the same input gives the same answer, and
-    ``jax.jit``, ``jax.vmap`` and ``jax.grad`` compose with it. Derivatives with respect to the clouds and to the
-    numbers in ``refine`` are those of the last step at fixed correspondences; without refinement they pass through the
-    network's last step, then also to the model's parameters; a search without refinement has none.
+    The 3D-URRT network estimates it from a subsample of both clouds, each about its centroid and both in units of their
+    common radius; a search over all poses takes over where that does not fit; refinement makes it exact on the full
+    clouds. The rotation is the same for any common unit and any origin of either cloud. A pure function: the same input
+    gives the same answer, and ``jax.jit``, ``jax.vmap`` and ``jax.grad`` compose with it. Derivatives with respect to
+    the clouds and to the numbers in ``refine`` are those of the pose at which refinement ends, correspondences held
+    fixed; without refinement they pass through the network's last step, then also to the model's parameters; a search
+    without refinement has none.
 
     On arrays, each stage is compiled by itself, once for each rung of a ladder of sizes (256, 1,024, 4,096, 16,384, …
     points): the next pair of any sizes on that rung compiles nothing. ``warm_up`` compiles ahead of time and
@@ -65,7 +67,8 @@ def register(
       search: how to look for the pose among all poses. "auto" searches only where the network's estimate, refined on a
         subsample of 512 points, does not fit. That look costs little; a search takes as long as the rest together, and
         much longer where it must be compiled first. "auto" does nothing where ``refine`` is None. A ``Search`` always
-        searches; None never does. Among poses that fit alike the network's stays.
+        searches; None never does. Among poses that fit about alike it prefers what
+        turns less from where the clouds are: a symmetric shape is not turned around.
       initial: (4, 4), a rough transform from source to target where one is known, as from odometry or a turntable: the
         network and the search begin with the source moved by it, and largest angles count from it. No derivative
         passes to it.
@@ -77,9 +80,10 @@ def register(
 
     Raises:
       ValueError: a cloud of the wrong shape or dtype, empty, with fewer than three distinct points or with values that
-        are not finite or beyond ±1e15; a mask of the wrong length; an inlier distance that is not positive; an initial
-        transform that is not rigid. Under jit values can't be seen: unusable points are then ignored, and a cloud left
-        without three points, or an initial transform that is not finite, is flagged by ``converged`` and ``outcome``.
+        are not finite or spread over more than 1e15; a mask of the wrong length; an inlier distance that is not
+        positive; an initial transform that is not rigid. Under jit values can't be seen: points that are not finite or
+        lie beyond ±1e15 are then ignored, and a cloud left without three points, or an initial transform that is not
+        finite, is flagged by ``converged`` and ``outcome``.
     """
     check_cloud(source, source_mask, "source")
     check_cloud(target, target_mask, "target")
@@ -101,7 +105,7 @@ def make_options(model: Model | None, refine: ICP | None, search: Search | Liter
     if isinstance(search, Search):
         search = _with_floats(search)
     if search == "auto":
-        return Options(model, refine, None if refine is None else Search(), always=False)
+        return Options(model, refine, None if refine is None else Search(preference=_AUTO_PREFERENCE), always=False)
     return Options(model, refine, search, always=search is not None)
 
 
@@ -137,19 +141,14 @@ def _register_arrays(
 def register_on_host(options: Options, pair: PairOnHost) -> Registration:
     """The registration of one pair, as NumPy arrays in the user's frame; the translation is float64."""
     size = rung(pair.size)
-    compile_ahead(options, size, pair.dtype)
+    start_compiling(options, size, pair.dtype)
     return pair.restore(jax.device_get(register_in_frame(options, *pair.padded(size))))
 
 
-_asked_for: set[tuple] = set()
-
-
-def compile_ahead(options: Options, size: int, dtype: np.dtype, batch: int | None = None) -> None:
+def start_compiling(options: Options, size: int, dtype: np.dtype, batch: int | None = None) -> None:
     """Starts to compile the stages that most pairs of a rung need, side by side, if this process has not yet."""
     key = jax.tree.structure(options), size, dtype, batch
-    if key not in _asked_for and not is_debugging():
-        register_in_frame(options, *abstract_pair(size, dtype, batch), batch=batch)
-        _asked_for.add(key)
+    compile_ahead(key, lambda: register_in_frame(options, *abstract_pair(size, dtype, batch), batch=batch))
 
 
 def _register_traced(
@@ -167,7 +166,8 @@ def _register_traced(
     if initial is not None:
         initial = _between_origins(initial, source_origin, target_origin)
     sizes = len(source), len(target)
-    inside_jit = isinstance(jnp.zeros(()), Tracer)  # also where vmap or grad stands between
+    # Inside jit, also where vmap or grad stands between, a new constant is traced; under bare vmap or grad it is not.
+    inside_jit = isinstance(jnp.zeros(()), Tracer)
     size = max(sizes) if inside_jit else rung(max(sizes))
     masks = (jnp.ones(len(points), bool) if mask is None else jnp.asarray(mask, bool) for points, mask in
              ((source, source_mask), (target, target_mask)))  # fmt: skip
@@ -197,12 +197,13 @@ def _register_padded(
 
 
 def _grid(points: Array) -> Array:
-    """The step between float32 numbers of the size of these coordinates, ()."""
+    """The step between numbers of the size of these coordinates in their dtype, ()."""
     size = jnp.max(jnp.where(jnp.isfinite(points), jnp.abs(points), 0.0))
-    return jax.lax.stop_gradient(size * jnp.finfo(jnp.float32).eps)
+    return jax.lax.stop_gradient(size * jnp.finfo(points.dtype).eps)
 
 
 def _leave(frame: Frame, outputs: Outputs) -> Registration:
+    """The result in the user's coordinates, under a trace (``PairOnHost.restore`` on arrays)."""
     scale, report = frame.scale, outputs.report
     pose, coarse = frame.leave(outputs.transform), frame.leave(outputs.coarse)
     stretch = jnp.concatenate([jnp.ones(3, scale.dtype), jnp.full(3, scale)])

@@ -15,7 +15,7 @@ from urrt_jax.rigid import Rigid
 
 
 class Outcome(enum.IntEnum):
-    """How a registration ended."""
+    """How a registration ended; ``Registration.reason`` says what each of these means."""
 
     CONVERGED = 0
     DEGENERATE = 1
@@ -59,14 +59,16 @@ class Registration:
       confidence: (), in [0, 1]: how sure it is that the surfaces lie on each other rather than cross, and that they do
         so in no other pose. Learned on training shapes, from overlap, from distances, and from how much worse the
         clouds agree after quarter and half turns. Low for symmetric shapes.
-      converged: (), bool: the input was finite and not collinear, refinement came to rest within its iterations (where
-        there was refinement), and the confidence is at least 0.5.
+      converged: (), bool: the input was finite, not collinear, and not so far from the origin that float32 lost its
+        digits; refinement came to rest within its iterations (where there was refinement); and the confidence is at
+        least 0.5.
       outcome: () int32, an ``Outcome``; ``reason`` says it in words.
       correspondences: (N,) int32, the row of the target's point nearest to every source point, -1 where none lies
         within ``inlier_distance``.
       information: (6, 6), of the pose, from these correspondences: Σ GᵀG, G = [I, −[q]×] at target points q, for small
         motions (translation, rotation vector) about the target's origin; what pose graphs take (Choi et al. 2015).
-      source_regions: (N,) int32, the network's region of every source point; 0 for padding and for model A.
+      source_regions: (N,) int32, the network's region of every source point; 0 for padding, and for a network
+        without regions (model A).
       target_regions: (M,) int32, the same for the target.
       coarse: the network's own estimate: after at most two steps where refinement follows, and after as many as its
         configuration says where none does.

@@ -4,8 +4,12 @@
 another. On arrays it reads from each result whether a rare stage is needed, and runs (and compiles) it only then. Under
 a trace the same stages are composed, and rare ones become loops that only run for pairs which need them.
 
-Network, search and the first stage of refinement see samples of fixed size: they are compiled once, whatever the
-clouds. Only ``prepare``, ``settle``, ``assess`` and ``label`` are compiled for each rung of the ladder.
+Network, search and the coarse stage of refinement see samples of fixed size: they are compiled once, whatever the
+clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole clouds and are compiled for each rung of the ladder,
+as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
+
+The *plain pose* is what registration has before any search: the network's estimate, or the user's initial transform
+where that fits better, after the coarse stage of refinement.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -23,7 +27,6 @@ from urrt_jax.loops import where_needed
 from urrt_jax.model.encoding import Encoding
 from urrt_jax.model.network import Model, point_regions
 from urrt_jax.model.network import estimate as apply_network
-from urrt_jax.neighbors import coarser_spacing
 from urrt_jax.prepared import THINNED, Prepared, Samples, Sizes
 from urrt_jax.programs import Program
 from urrt_jax.refine import ICP, find_basin
@@ -35,8 +38,9 @@ STEPS_BEFORE_REFINEMENT = 2
 """Steps of the network, at most, where refinement follows, which does the rest."""
 _SMALLEST_RUNG, _FACTOR = 256, 4
 _SAMPLE = 512  # points of the even subsample, at least
-# The fit of the plain pose on the subsample (``Fit.surfaces``) below which a search is called for. Dense clouds are
-# searched more readily, because their quick look is cheap and seldom wrong. Chosen on training shapes and bunny pairs.
+# The logit of the plain pose's fit on the subsample (``Fit.surfaces``) below which a search is called for, and below
+# which a pose that is not sure counts as a misfit rather than as ambiguous. Dense clouds are searched more readily,
+# because their quick look is cheap and seldom wrong. Chosen on training shapes and bunny pairs.
 _FITS, _FITS_DENSE = -0.5, 0.2
 _COARSE_GRID, _LOST_GRID = 0.1, 1.0
 """The step between float32 coordinates, in spacings, from which on lost digits explain a failure, and from which on no
@@ -76,14 +80,14 @@ class Plan(NamedTuple):
     """The plain pose and the rare stages that it calls for.
 
     Attributes:
-      found: the network's pose, refined on even samples; ``pending`` where it calls for a search.
+      found: the plain pose; ``pending`` where it calls for a search.
       quick: (), bool, whether the search begins with a quick look.
-      large: (), bool, whether refinement begins among thinned clouds.
+      thin_first: (), bool, whether refinement begins among thinned clouds.
     """
 
     found: Found
     quick: Array
-    large: Array
+    thin_first: Array
 
 
 class Report(NamedTuple):
@@ -120,16 +124,16 @@ class Told(NamedTuple):
     """What is known of a pair besides its clouds, all in the pair's frame.
 
     Attributes:
-      begin: (), bool, whether there is an initial transform.
-      offset: (3,), the translation that is left of it in the frame, between the clouds' centroids.
-      usable: (), bool, whether it is finite.
+      has_initial: (), bool, whether there is an initial transform. The source has been moved by it.
+      offset: (3,), all that is left of it in the frame: a translation, because each cloud was centred.
+      initial_is_finite: (), bool; True where there is none.
       inlier_distance: (), 0 for the default.
       grid: (), the step between the coordinates that float32 could hold.
     """
 
-    begin: Any
+    has_initial: Any
     offset: Any
-    usable: Any
+    initial_is_finite: Any
     inlier_distance: Any
     grid: Any
 
@@ -148,14 +152,14 @@ class Outputs(NamedTuple):
 @Program
 def estimate(model: Model, source: Samples, target: Samples, told: Told) -> Start:
     """Where registration begins, from even samples of both clouds."""
-    few = first(source.even, model.config.points), first(target.even, model.config.points)
-    answer = apply_network(model, *few)
+    answer = apply_network(model, *(first(each.even, model.config.points) for each in (source, target)))
     nothing = rigid.identity()
     given = Rigid(nothing.rotation, told.offset)
     poses = jax.tree.map(lambda *leaves: jax.lax.stop_gradient(jnp.stack(leaves)), answer.transform, given)
+    even = source.even, target.even
     scores = jax.lax.cond(
-        jnp.asarray(told.begin),
-        lambda: agreement(poses, (source.even, target.even), (source.even, target.even), coarser_spacing(*few)),
+        jnp.asarray(told.has_initial),
+        lambda: agreement(poses, even, even, prepared.coarser(source, target)),
         lambda: jnp.zeros(2, poses.translation.dtype),
     )
     begin = jax.tree.map(lambda own, other: jnp.where(scores[0] < scores[1], other, own), answer.transform, given)
@@ -168,8 +172,8 @@ def approach(
 ) -> Plan:
     """The plain pose, refined on even samples, and what it calls for."""
     how, always = options
-    transform, width = find_basin(how, source.even, target.even, start)
-    glance = fit_samples(source.even, target.even, transform)
+    transform, width = find_basin(how, source, target, start)
+    glance = fit_samples(source.even, target.even, transform, prepared.coarser(source, target))
     fewer = jnp.minimum(*counts)
     dense = fewer >= search.DENSE
     pending = jnp.asarray(always) | (glance.surfaces < jnp.where(dense, _FITS_DENSE, _FITS))
@@ -191,12 +195,12 @@ def assess(
     inlier = source.cloud.mask & (squared <= reach**2)
     rows = jnp.where(inlier, target.rows[found.nearest], -1)
     determined = well_posed(source.cloud) & well_posed(target.cloud) & jnp.all(jnp.isfinite(transform.translation))
-    confidence = jnp.where(determined & told.usable, found.confidence, 0.0)
+    confidence = jnp.where(determined & told.initial_is_finite, found.confidence, 0.0)
     sure = confidence >= 0.5
     lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * prepared.coarser(source, target)
     # In order of precedence; the first that holds is the outcome.
     outcomes = {
-        Outcome.INITIAL: ~jnp.asarray(told.usable),
+        Outcome.INITIAL: ~jnp.asarray(told.initial_is_finite),
         Outcome.DEGENERATE: ~determined,
         Outcome.DIGITS: told.grid > lost,
         Outcome.UNSETTLED: jnp.asarray(refined) & ~settled,
@@ -253,15 +257,20 @@ def register_in_frame(
     def call(program: Program, *arguments: Any) -> Any:
         return (program if batch is None else program.batched)(*arguments)
 
-    def wanted(flag: Any, least: int = 0) -> bool:
-        """Whether a stage is to be called at all that some pairs need, none of them of fewer than ``least`` points."""
-        if mode == "traced":
-            return source.mask.shape[-1] >= least
-        return rare if mode == "abstract" else bool(np.any(flag))
+    size = source.mask.shape[-1]
 
-    def when(needed: Any, program: Program, arguments: tuple, otherwise: Any, least: int = 0) -> Any:
+    def wanted(flag: Any, *, least: int = 0, often: bool = False) -> bool:
+        """Whether to call a stage that some pairs need, and no pair of fewer than ``least`` points.
+
+        ``often`` says that most of the others need it: it is compiled ahead although ``rare`` is False.
+        """
+        if mode == "concrete":
+            return bool(np.any(flag))
+        return size >= least and (mode == "traced" or rare or often)
+
+    def when(needed: Any, program: Program, arguments: tuple, otherwise: Any, *, least: int = 0) -> Any:
         """The program's answer for the pairs that need it."""
-        if not wanted(needed, least):
+        if not wanted(needed, least=least):
             return otherwise
         if mode == "traced":
             # As a list: JAX puts flags in place of leaves, which the checks of Search would refuse.
@@ -277,20 +286,21 @@ def register_in_frame(
     clouds = call(prepare, sizes, source), call(prepare, sizes, target)
     samples = clouds[0].samples, clouds[1].samples
     start = call(estimate, model, *samples, told)
-    pose, settled, steps = start.transform, told.usable, np.int32(0)
+    # Where there is no refinement, all that can be unsettled is an initial transform that is not finite.
+    pose, settled, steps = start.transform, told.initial_is_finite, np.int32(0)
     if how is not None or searching is not None:
         counts = clouds[0].count, clouds[1].count
-        found, quick, large = call(approach, (refiner, always), *samples, counts, start.transform)
+        found, quick, thin_first = call(approach, (refiner, always), *samples, counts, start.transform)
         if searching is not None:
             found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
             pose = found.transform
     if how is not None:
         pose, width = found.transform, found.width
-        if wanted(large, least=THINNED + 1):
+        if wanted(thin_first, least=THINNED + 1, often=True):
             pose, width = call(settle_thinned, how, *clouds, pose, width)
         end = last = call(settle, how, *clouds, pose, width)
-        if wanted(end.sparse):
+        if (mode != "abstract" or size <= rung(how.em_points)) and wanted(end.sparse):
             last = call(expect, how, *clouds, end)
         pose, settled, steps = last.transform, last.converged, last.iterations
         if mode == "traced":
@@ -317,6 +327,7 @@ def sizes_of(options: Options) -> Sizes:
 
 
 def _mode(*arguments: Any) -> Literal["traced", "abstract", "concrete"]:
+    """Whether programs are to be composed into what is traced, compiled only, or run."""
     leaves = jax.tree.leaves(arguments)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return "traced"

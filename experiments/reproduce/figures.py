@@ -15,7 +15,7 @@ _OURS = {
     "search_all": "#7b241c",
     "search_near": "#2c0b08",
     "register": "#c0392b",
-    "auto": "#a93226",
+    "plain": "#a93226",
     "network": "#e59866",
 }
 _COLORS = (

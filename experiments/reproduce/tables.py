@@ -21,6 +21,8 @@ _COLUMNS: dict[str, tuple[str, str, bool]] = {
     "recall_5deg_0.05": ("recall 5° / 0.05", ".3f", False),
     "recall_5deg_0.1": ("recall 5° / 0.1", ".3f", False),
     "chamfer_mean": ("Chamfer", ".5f", True),
+    "converged": ("called converged", ".3f", False),
+    "converged_but_off_by_5deg": ("converged, but off by 5°", ".3f", True),
     "failures": ("failures", "d", True),
 }
 

@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation
 from urrt_jax import rigid
 from urrt_jax.model.consensus import align_landmarks, even_seeds, hypotheses
 
-_HASTY = {"xla_backend_optimization_level": 0}  # compiling takes far longer than running
 
-
-@functools.partial(jax.jit, static_argnames=("rounds", "hypotheses"), compiler_options=_HASTY)
+@functools.partial(jax.jit, static_argnames=("rounds", "hypotheses"))
 def _align(source, target, weights, *, rounds, hypotheses=0):
     seeds = even_seeds([len(weights)], hypotheses)
     return align_landmarks(source, target, weights, rounds=rounds, seeds=seeds)
@@ -164,9 +162,7 @@ def test_derivatives_are_those_of_the_rounds(pose):
         seeds = even_seeds([len(weights)], hypotheses)
         return align_landmarks(source, target + shift * source**2, weights, rounds=40, seeds=seeds)[1][2]
 
-    slope, plain = (
-        float(jax.jit(jax.grad(height), static_argnums=1, compiler_options=_HASTY)(0.0, k)) for k in (64, 0)
-    )
+    slope, plain = (float(jax.jit(jax.grad(height), static_argnums=1)(0.0, k)) for k in (64, 0))
     assert np.isfinite(slope)
     assert slope == pytest.approx(plain, rel=1e-2)
 
@@ -178,7 +174,7 @@ def test_derivatives_at_coinciding_landmarks_are_finite():
     def total(places):
         return jnp.sum(align_landmarks(places, same, _weights(), rounds=3, seeds=seeds)[1])
 
-    slopes = jax.jit(jax.grad(total), compiler_options=_HASTY)(same)
+    slopes = jax.jit(jax.grad(total))(same)
     assert np.all(np.isfinite(slopes))
 
 
@@ -200,7 +196,7 @@ def test_no_seeds(groups):
 
 
 _every = np.arange(20)
-_say = jax.jit(lambda source, target, weights: hypotheses(source, target, weights, _every), compiler_options=_HASTY)
+_say = jax.jit(lambda source, target, weights: hypotheses(source, target, weights, _every))
 
 
 def test_every_hypothesis_of_matching_landmarks_is_their_motion(pose):

@@ -23,8 +23,7 @@ from urrt_jax.model.landmarks import (
 )
 from urrt_jax.model.pose import fuse_poses
 
-_HASTY = {"xla_backend_optimization_level": 0}  # compiling takes far longer than running
-_estimate = jax.jit(estimate, compiler_options=_HASTY)
+_estimate = jax.jit(estimate)
 _normalize_pair = jax.jit(frames.normalize_pair)
 
 

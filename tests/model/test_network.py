@@ -30,8 +30,7 @@ from urrt_jax.training.pairs import PairConfig, make_pair
 from urrt_jax.training.state import TrainConfig
 from urrt_jax.training.step import pair_loss
 
-_HASTY = {"xla_backend_optimization_level": 0}  # compiling takes far longer than running
-_predict, _estimate, _encode = (jax.jit(each, compiler_options=_HASTY) for each in (predict, estimate, encode))
+_predict, _estimate, _encode = (jax.jit(each) for each in (predict, estimate, encode))
 _init = jax.jit(init_model, static_argnums=1)
 
 
@@ -61,7 +60,7 @@ def pair(cloud, pose):
 def test_aligned_clouds_are_proposed_to_stay(model, pair, x64):
     """Decoders that regress the pose propose what they estimate in one step."""
     cloud = make_cloud(pair[0] - pair[0].mean(axis=0))
-    proposed = jax.jit(propose, static_argnums=3, compiler_options=_HASTY)(model, cloud, cloud, 8)
+    proposed = jax.jit(propose, static_argnums=3)(model, cloud, cloud, 8)
     expected = rigid.identity()
     if model.config.decoder == "pose":
         expected = _estimate(model.at_most(1), cloud, cloud).transform
@@ -112,7 +111,7 @@ def test_jit_agrees_with_eager(small_model, pair, x64):
 def test_vmap_agrees_with_a_loop(model, pair, cloud, x64):
     sources, targets = np.stack([pair[0], cloud[60:120]]), np.stack([pair[1], cloud[120:180]])
     both = jax.vmap(lambda s, t: predict(model, make_cloud(s), make_cloud(t)))
-    together = jax.jit(both, compiler_options=_HASTY)(sources, targets)
+    together = jax.jit(both)(sources, targets)
     for i in range(2):
         alone = _predict(model, make_cloud(sources[i]), make_cloud(targets[i]))
         _close(jax.tree.map(lambda leaf, i=i: leaf[i], together), alone, atol=1e-9)
@@ -184,7 +183,7 @@ def _degenerate() -> dict[str, np.ndarray]:
 def gradient_onto_itself(model):
     """Value and gradient, in parameters and source, of an answer for equal clouds of 60 points at most."""
 
-    @functools.partial(jax.jit, compiler_options=_HASTY)
+    @jax.jit
     @functools.partial(jax.value_and_grad, argnums=(0, 1))
     def total(params, source, target, mask):
         answer = predict(Model(model.config, params), make_cloud(source, mask), make_cloud(target, mask))
@@ -212,7 +211,7 @@ def test_gradient_in_the_parameters_agrees_with_finite_differences(model, pair, 
     rng = np.random.default_rng(0)
     along = jax.tree.unflatten(tree, [jnp.asarray(rng.normal(size=leaf.shape)) for leaf in leaves])
 
-    @functools.partial(jax.jit, compiler_options=_HASTY)
+    @jax.jit
     @jax.value_and_grad
     def total(step):
         moved = {k: jax.tree.map(lambda a, b: a + step * b, model.params[k], along[k]) for k in along}
@@ -229,7 +228,7 @@ def test_estimate_has_no_derivative_in_the_partition(small_model, pair):
         params = small_model.params | {"partition": partition}
         return jnp.sum(predict(Model(small_model.config, params), *map(make_cloud, pair)).rotation)
 
-    gradient = jax.jit(jax.grad(total), compiler_options=_HASTY)(small_model.params["partition"])
+    gradient = jax.jit(jax.grad(total))(small_model.params["partition"])
     assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
@@ -248,7 +247,7 @@ def loss_gradient(small_model, cloud):
         _, metrics = jax.vmap(lambda one: pair_loss(model, one, jax.random.key(1), config))(batch)
         return jnp.array([jnp.mean(metrics["loss"]), jnp.mean(metrics["occupancy"])])
 
-    jacobian = jax.jit(jax.jacrev(losses), compiler_options=_HASTY)(small_model.params)
+    jacobian = jax.jit(jax.jacrev(losses))(small_model.params)
     parts = [jax.tree.map(lambda leaf, i=i: leaf[i], jacobian) for i in range(2)]
 
     def gradient(weight: float):

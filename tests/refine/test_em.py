@@ -17,7 +17,6 @@ from urrt_jax.rigid import Rigid
 TURN = Rotation.from_euler("zyx", [2, -1, 1.5], degrees=True).as_matrix()
 SHIFT = np.array([0.02, -0.01, 0.015])
 _ROWS = 160
-_HASTY = {"xla_backend_optimization_level": 0}
 
 
 def _egg(count: int, seed: int, noise: float = 0.0) -> np.ndarray:
@@ -54,7 +53,7 @@ def _differentiable(source: Cloud, target: Cloud, start: Rigid, how: ICP = _FAR)
     return expected_pose(how, *clouds, start, expect(how, *clouds, _settled(start, True)))
 
 
-_expect = jax.jit(_expected, compiler_options=_HASTY)
+_expect = jax.jit(_expected)
 
 
 def _start(degrees: float = 1.0) -> Rigid:
@@ -126,7 +125,7 @@ def test_turning_the_target_turns_the_answer(pair, found):
 
 def _matched(points: np.ndarray, others: np.ndarray, normals: np.ndarray, deviations) -> Match:
     sides = [Side(_cloud(each), jnp.asarray(np.resize(normals, (_ROWS, 3)), jnp.float32)) for each in (points, others)]
-    return jax.jit(match, compiler_options=_HASTY)(*sides, rigid.identity(), jnp.asarray(deviations, jnp.float32))
+    return jax.jit(match)(*sides, rigid.identity(), jnp.asarray(deviations, jnp.float32))
 
 
 def test_estimates_how_far_points_lie_along_and_across_the_surface():
@@ -174,7 +173,7 @@ def test_derivatives_agree_with_finite_differences(pair, x64):
         found = _differentiable(*moved, move(steps[2] * motion, _start()), ICP(iterations=300, tolerance=1e-11))
         return jnp.sum(weights * jnp.concatenate([found.rotation, found.translation[:, None]], axis=1))
 
-    both = jax.jit(jax.value_and_grad(total), compiler_options=_HASTY)
+    both = jax.jit(jax.value_and_grad(total))
     expected = [float(both(step)[0] - both(-step)[0]) / 2e-6 for step in 1e-6 * jnp.eye(3)]
     np.testing.assert_allclose(both(jnp.zeros(3))[1], expected, rtol=2e-3)
 
@@ -196,7 +195,7 @@ def gradient_of(pair):
         found = _differentiable(Cloud(points, mask), _cloud(pair[1]), _start())
         return jnp.sum(found.rotation) + jnp.sum(found.translation), found
 
-    return jax.jit(jax.grad(total, has_aux=True), compiler_options=_HASTY)
+    return jax.jit(jax.grad(total, has_aux=True))
 
 
 @pytest.mark.parametrize("kind", _POOR)
@@ -210,7 +209,7 @@ def test_poor_clouds_give_finite_poses_and_derivatives(kind, gradient_of):
 def test_vmap_agrees_with_one_by_one(pair, found):
     clouds = [jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), _cloud(points)) for points in pair]
     starts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), _start())
-    together = jax.jit(jax.vmap(_expected), compiler_options=_HASTY)
+    together = jax.jit(jax.vmap(_expected))
     many = together(*clouds, starts, jnp.array([True, False, True]))
     np.testing.assert_array_equal(np.asarray(many.iterations) > 0, [True, False, True])
     for row in (0, 2):

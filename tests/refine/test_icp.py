@@ -22,7 +22,6 @@ TURN = Rotation.from_euler("zyx", [8, -5, 6], degrees=True).as_matrix()
 # Compiling takes far longer than running: clouds are padded to one of three sizes, every stage is compiled once for
 # each, and programs for derivatives, which run on small clouds, are not optimised.
 _SMALL, _ROWS, _LARGE = 200, 1320, 6600
-_HASTY = {"xla_backend_optimization_level": 0}
 _SIZES = Sizes(sample=512, queries=ICP().points, normal_radius=ICP().normal_radius)
 
 _normalize = jax.jit(normalize_pair)
@@ -299,7 +298,7 @@ def _pose_sum(numbers: dict, clouds: tuple[Cloud, Cloud], ends: tuple[Settled, S
     return jnp.sum(weights * jnp.concatenate([pose.rotation, pose.translation[:, None]], axis=1))
 
 
-_slope = jax.jit(jax.value_and_grad(_pose_sum, argnums=(0, 1), allow_int=True), compiler_options=_HASTY)
+_slope = jax.jit(jax.value_and_grad(_pose_sum, argnums=(0, 1), allow_int=True))
 
 
 def _sum_and_slope(clouds: tuple[Cloud, Cloud], how: ICP = _EXACTLY):
@@ -375,7 +374,7 @@ def test_the_differentiable_pose_is_the_end_of_the_last_stage(x64):
         jax.tree.map(np.testing.assert_array_equal, _pose(_EXACTLY, *ready, *ends), ends[1].transform)
 
 
-_pose = jax.jit(differentiable_pose, compiler_options=_HASTY)
+_pose = jax.jit(differentiable_pose)
 
 
 @pytest.mark.parametrize("shape", _DEGENERATE)
@@ -421,7 +420,7 @@ def test_vmap_agrees_with_a_loop(ready_pairs):
         pose, width = find_basin(ICP(), source.samples.even, target.samples.even, rigid.identity())
         return expect(ICP(), source, target, settle(ICP(), source, target, pose, width))
 
-    together = jax.jit(jax.vmap(stages), compiler_options=_HASTY)(*_stacked(ready_pairs))
+    together = jax.jit(jax.vmap(stages))(*_stacked(ready_pairs))
     alone = [_at_end(ICP(), pair, rigid.identity())[1] for pair in ready_pairs]
     np.testing.assert_array_equal(together.sparse, [False, True, False])
     np.testing.assert_array_equal(together.converged, [bool(each.converged) for each in alone])
@@ -443,8 +442,8 @@ def test_derivatives_in_a_batch_agree_with_a_loop(ready_pairs):
         return jax.grad(total)(source.queries.points)
 
     ends = [_at_end(ICP(), pair, rigid.identity())[0] for pair in ready_pairs]
-    together = jax.jit(jax.vmap(slope), compiler_options=_HASTY)(*_stacked(ready_pairs), _stacked(ends))
-    alone = [jax.jit(slope, compiler_options=_HASTY)(*pair, end) for pair, end in zip(ready_pairs, ends, strict=True)]
+    together = jax.jit(jax.vmap(slope))(*_stacked(ready_pairs), _stacked(ends))
+    alone = [jax.jit(slope)(*pair, end) for pair, end in zip(ready_pairs, ends, strict=True)]
     for found, expected in zip(together, alone, strict=True):
         assert np.abs(expected).max() > 1e-4
         np.testing.assert_allclose(found, expected, atol=1e-3 * float(jnp.max(jnp.abs(expected))))

@@ -47,7 +47,7 @@ def test_clean_pairs_are_registered_exactly():
     assert clean["network"]["mae_rotation"] <= 0.30
     assert clean["network"]["asymmetric"]["mae_rotation"] <= 0.15
     assert clean["network"]["asymmetric"]["recall_1deg"] >= 0.97
-    assert clean["register"]["recall_1deg"] >= 0.999
+    assert clean["plain"]["recall_1deg"] >= 0.999
 
 
 def test_clean_pairs_need_no_network():
@@ -69,7 +69,7 @@ def test_clean_pairs_need_no_network():
 )
 def test_mean_error_on_corrupted_pairs_is_small(name, protocol, mean):
     """In degrees, without axisymmetric categories, whose rotation about the axis the points do not determine."""
-    refined = rows(name, protocol)["register"]["asymmetric"]
+    refined = rows(name, protocol)["plain"]["asymmetric"]
     assert refined["angle_mean"] <= mean
     assert refined["recall_5deg_0.1"] >= 0.99
 
@@ -78,12 +78,12 @@ def test_mean_error_on_corrupted_pairs_is_small(name, protocol, mean):
     "protocol", ["incomplete", "incomplete_both", "outliers share=0.05", "outliers", "outliers share=0.2"]
 )
 def test_refinement_is_exact_on_half_of_the_pairs_whose_points_correspond(protocol):
-    assert rows("table2_noise", protocol)["register"]["angle_median"] < 1e-3
+    assert rows("table2_noise", protocol)["plain"]["angle_median"] < 1e-3
 
 
 def test_two_sided_crops_have_a_smaller_error_than_omnet_published():
     """OMNet: 0.339° on its own sample of these shapes."""
-    assert rows("table2_noise", "incomplete_both")["register"]["asymmetric"]["mae_rotation"] <= 0.339
+    assert rows("table2_noise", "incomplete_both")["plain"]["asymmetric"]["mae_rotation"] <= 0.339
 
 
 def test_crops_searched_about_the_middle_of_the_poses_are_as_good_as_learned_methods():
@@ -97,7 +97,7 @@ def test_search_finds_the_poses_of_real_scans():
 
 
 def test_no_wrong_pose_of_a_real_scan_is_called_converged():
-    assert rows("beyond", "scans")["register"]["converged_but_off_by_5deg"] == 0
+    assert rows("beyond", "scans")["plain"]["converged_but_off_by_5deg"] == 0
 
 
 @pytest.mark.parametrize("pairs", ["all", "all but axisymmetric shapes", "real scans"])

@@ -17,7 +17,7 @@ from experiments.summary import load
 ROOT = Path(__file__).parents[2]
 EXPERIMENTS, WEIGHTS = ROOT / "experiments", ROOT / "urrt_jax" / "weights"
 README = (ROOT / "README.md").read_text()
-TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond", "unseen")
+TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond", "unseen", "default_call")
 OTHERS = ("figure4_qualitative", "confidence", "regions")
 FILES = (*(f"{name}/results.json" for name in (*TABLES, *OTHERS)), "benchmarks/speed.json")
 MODELNET40_TEST = 2468  # shapes in the test split

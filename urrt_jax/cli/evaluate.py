@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,11 +23,11 @@ class Evaluate:
         protocol: How pairs are made: dcp, prnet, prnet_noise, rpmnet (needs --points 2048), incomplete,
             incomplete_both, drift, drift_target, outliers, independent, independent_noise, scans. Options follow the
             name, as in 'outliers share=0.2'.
-        methods: network, register and search are ours: alone, refined, and after a search within 90° (search_all: among
-            all rotations; auto: where it is needed); a model of its own may follow, as in network:modelnet40-paper.
-            identity and principal_axes need nothing; icp, icp_identity, icp_plane, gicp, fgr, fgr_icp, ransac,
-            ransac_icp, kiss, and on scans scan_icp, scan_fgr, scan_ransac, scan_kiss need 'urrt-jax[peers]'; goicp says
-            how to install it.
+        methods: network, register, plain and search are ours: the network alone, register as it is by default, without
+            a search, and always after a search within 90° (search_all: among all rotations); a model of its own may
+            follow, as in network:modelnet40-paper. identity and principal_axes need nothing; icp, icp_identity,
+            icp_plane, gicp, fgr, fgr_icp, ransac, ransac_icp, kiss, and on scans scan_icp, scan_fgr, scan_ransac,
+            scan_kiss need 'urrt-jax[peers]'; goicp says how to install it.
         model: Ours: name of a packaged model, or a file written by 'urrt train'.
         limit: At most so many items, evenly spread.
         points: Points of each shape.
@@ -74,6 +75,8 @@ class Evaluate:
 
         self.out.parent.mkdir(parents=True, exist_ok=True)
         figures, failures = {}, {}
+        if sys.stderr.isatty() and any(method.batch > 1 for method in methods.values()):
+            print("urrt: ours compile at the first batch, unless an earlier run kept the programs", file=sys.stderr)
         for name, method in methods.items():
             save = values_path(self.out.parent / "items", name, method, self.protocol, pairs, items)
             save.parent.mkdir(exist_ok=True)

@@ -22,7 +22,7 @@ _BATCH = 32  # pairs: on a CPU, twice as many leave its caches and take an eight
 _OURS: dict[str, dict[str, Any]] = {
     "network": {"refine": None},
     "register": {},
-    "auto": {"search": "auto"},
+    "plain": {"search": None},
     "search": {"search": Search(max_angle=90.0)},
     "search_near": {"search": Search(max_angle=45.0, preference=0.2, kept=16), "informed": True},
     "search_all": {"search": Search(), "batch": 1},  # scans, each of which takes a time of its own
@@ -71,7 +71,7 @@ class Ours:
     Attributes:
       model: the network.
       refine: as for ``register``.
-      search: as for ``register``, but None by default.
+      search: as for ``register``.
       informed: whether it begins at the rotation that the protocol expects (``Trial.expected``).
       name: of the model, for titles.
       batch: pairs at once.
@@ -79,19 +79,20 @@ class Ours:
 
     model: Model
     refine: ICP | None = ICP()
-    search: Search | Literal["auto"] | None = None
+    search: Search | Literal["auto"] | None = "auto"
     informed: bool = False
     name: str = "model"
     batch: int = _BATCH
 
     @property
     def title(self) -> str:
-        stages = ["network alone" if self.refine is None else "refined"]
-        if self.search == "auto":
-            stages.insert(0, "searched where needed")
-        elif self.search is not None:
-            stages.insert(0, "searched about the middle of the protocol's poses" if self.informed else "searched")
-        return f"ours, {' and '.join(stages)} ({self.name})"
+        if isinstance(self.search, Search):
+            how = "searched about the middle of the protocol's poses" if self.informed else "searched"
+        elif self.refine is None:
+            how = "network alone"
+        else:
+            how = "without search" if self.search is None else "register"
+        return f"ours, {how} ({self.name})"
 
     def identity(self) -> dict[str, Any]:
         return {
@@ -99,7 +100,7 @@ class Ours:
             "parameters_sha256": _digest(self.model),
             "config": dataclasses.asdict(self.model.config),
             "refine": _plain(self.refine),
-            "search": _plain(self.search),
+            "search": None if self.refine is None and self.search == "auto" else _plain(self.search),
         } | ({"informed": True} if self.informed else {})
 
     def align(
@@ -158,10 +159,10 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
     """The method of a name, a model, or a function of one pair that returns the (4, 4) matrix of the pose.
 
     Args:
-      method: ``"network"``, ``"register"`` and ``"search"`` are ours: alone, refined, and refined after a global search
-        over rotations up to 90°, which hold the protocols' own (``"search_all"``: over all rotations, for scans;
-        ``"search_near"``: about the middle of the protocol's own, which learned methods know from training;
-        ``"auto"``: only where it is needed, as ``register`` does by default); a model of its own may follow, as in
+      method: ``"network"``, ``"register"``, ``"plain"`` and ``"search"`` are ours: the network alone, ``register`` as
+        it is by default, without a search, and always after a search over rotations up to 90°, which hold the
+        protocols' own (``"search_all"``: over all rotations, for scans; ``"search_near"``: about the middle of the
+        protocol's own, which learned methods know from training); a model of its own may follow, as in
         ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
       model: what ours uses where the name says nothing of it: a packaged name or a file.
 

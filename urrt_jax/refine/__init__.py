@@ -1,4 +1,4 @@
-"""Refinement: from a rough transform to an exact one, in up to four stages.
+"""Refinement: from a rough transform to an exact one.
 
 ``find_basin`` on even samples, ``settle_thinned`` for large pairs, ``settle`` on whole clouds, and ``expect`` (EM-ICP)
 for small clouds without counterparts. ``differentiable_pose`` adds the derivatives of where they end.

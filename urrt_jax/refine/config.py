@@ -19,21 +19,21 @@ class ICP:
     which may be traced, batched and differentiated, and whose values compile nothing anew.
 
     Attributes:
-      coarse_points: points of the source in the first stage, which finds the basin of convergence, point to point;
+      coarse_points: points of the source in the coarse stage, which finds the basin of convergence, point to point;
         twice as many of the target. 0 skips that stage.
-      coarse_iterations: the most iterations of the first stage.
-      reach: the first stage's weights fall to a quarter at this distance, in units of the clouds' radius. The distance
+      coarse_iterations: the most iterations of the coarse stage.
+      reach: the coarse stage's weights fall to a quarter at this distance, in units of the clouds' radius. The distance
         shrinks from here to the spacing of the subsample.
-      points: points of each cloud that look for their nearest neighbour in the whole other cloud, in the second stage.
-      iterations: the most iterations of the second stage.
-      inlier_distance: the second stage's weights fall to a quarter at this many spacings of the coarser cloud, after
-        they have shrunk from the first stage's spacing. Where the correspondences turn out to be closer than that, the
+      points: points of each cloud that look for their nearest neighbour in the whole other cloud, in the fine stage.
+      iterations: the most iterations of the fine stage.
+      inlier_distance: the fine stage's weights fall to a quarter at this many spacings of the coarser cloud, after
+        they have shrunk from the coarse stage's spacing. Where the correspondences turn out to be closer than that, the
         distance shrinks further, down to a twentieth.
       plane: the share, in [0, 1], of the distance to the neighbour's tangent plane; the rest is the distance to the
         neighbour itself. Planes let samples of one surface slide on each other; points hold where planes do not.
       normal_radius: the radius of the neighbourhood of a normal, in spacings.
-      em_points: clouds with at most this many points get a third stage, EM-ICP, of at most ``iterations`` iterations,
-        where the second stage found that points have no counterparts and that the clouds overlap as a whole. Every
+      em_points: clouds with at most this many points get a further stage, EM-ICP, of at most ``iterations`` iterations,
+        where the fine stage found that points have no counterparts and that the clouds overlap as a whole. Every
         source point is matched to all target points, weighted by likelihood. Time and memory grow with the square of
         the number of points; 0 leaves the stage out.
       tolerance: a stage has converged when a step turns by less than this (radians), moves by less than this share of

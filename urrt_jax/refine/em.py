@@ -71,7 +71,7 @@ class _Progress(NamedTuple):
 
 
 def expect(refine: ICP, source: Prepared, target: Prepared, settled: Settled) -> Settled:
-    """The end of EM-ICP, from where the second stage ended, if that found the clouds sparse; if not, that end itself.
+    """The end of EM-ICP, from where the fine stage ended, if that found the clouds sparse; if not, that end itself.
 
     Args:
       refine: how to refine.

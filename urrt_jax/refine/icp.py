@@ -1,9 +1,9 @@
 """Iterative closest points, robust and coarse to fine, whose end differentiates.
 
-The first stage finds the basin of convergence on small even samples, point to point (Besl and McKay 1992). The second
+The coarse stage finds the basin of convergence on small even samples, point to point (Besl and McKay 1992). The second
 makes the pose exact: correspondences in both directions, distances along normals as well as between points. Large
 clouds go through it thinned first. Both stages weigh correspondences by Geman and McClure's function, whose width
-shrinks step by step (as in Zhou et al. 2016): in the second stage to the spacing, and from there to the spread of the
+shrinks step by step (as in Zhou et al. 2016): in the fine stage to the spacing, and from there to the spread of the
 correspondences themselves. Where points have counterparts the spread is next to nothing, and points without one do not
 pull.
 """
@@ -17,15 +17,15 @@ from jax import Array
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, first
 from urrt_jax.loops import while_each
-from urrt_jax.neighbors import LEAST_SPACING, nearest, spacing
-from urrt_jax.prepared import THINNED, Prepared, coarser, thinned_spacing
+from urrt_jax.neighbors import nearest
+from urrt_jax.prepared import THINNED, Prepared, Samples, coarser, thinned_spacing
 from urrt_jax.refine.config import ICP
 from urrt_jax.refine.pairs import Pairs, Surface, both, find_pairs, pair_up, robust_weights
 from urrt_jax.refine.solver import bounded_step, move, normal_equations, root_at_zero, small_step
 from urrt_jax.rigid import Rigid, procrustes
 
 # All constants were chosen on training shapes.
-_SHRINK, _SHRINK_FINE = 0.8, 0.7  # of the width a step, in the first and in the second stage
+_SHRINK, _SHRINK_FINE = 0.8, 0.7  # of the width a step, in the coarse and in the fine stage
 _SPREADS = 2.0  # the last width, in root mean square distances of the correspondences that count
 _NARROWEST = 0.05  # the least width, in inlier distances
 _STEADY, _STEADY_SHARE = 20.0, 1000.0  # a settled width changes by less: tolerances, and floors each
@@ -72,25 +72,26 @@ def _begin(transform: Rigid, width: Array, most: Array | int) -> _Progress:
     return _Progress(transform, width, jnp.array(False), jnp.array(False), jnp.array(0), jnp.asarray(most))
 
 
-def find_basin(refine: ICP, source: Cloud, target: Cloud, start: Rigid) -> tuple[Rigid, Array]:
-    """The transform after the first stage, and the distance, (), within which it can be trusted: the spacing.
+def find_basin(refine: ICP, source: Samples, target: Samples, start: Rigid) -> tuple[Rigid, Array]:
+    """The transform after the coarse stage, and the distance, (), within which it can be trusted.
+
+    That is the spacing of the target's sample; where the stage is left out, ``refine.reach``.
 
     Args:
       refine: how to refine.
-      source: an even sample, farthest points first (``subsample``), of at least ``coarse_points`` points.
-      target: the same, of twice as many.
+      source: samples of the source; the even one has at least twice ``coarse_points`` points.
+      target: samples of the target.
       start: rough transform.
     """
-    start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf).astype(source.points.dtype), start)
+    source, target, start = jax.lax.stop_gradient((source, target, start))
+    dtype = source.spacing.dtype
+    start, reach = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), (start, refine.reach))
     if not refine.coarse_points:
-        return start, jnp.asarray(refine.reach, source.points.dtype)
+        return start, reach
     # The first points of a farthest-point sample are a coarser one.
-    source, target = jax.lax.stop_gradient(
-        (first(source, refine.coarse_points), first(target, 2 * refine.coarse_points))
-    )
-    floor = jnp.maximum(spacing(target), LEAST_SPACING)
-    reach = jnp.asarray(refine.reach, floor.dtype)
-    return anneal(source, target, start, reach, floor, iterations=refine.coarse_iterations), floor
+    few, more = first(source.even, refine.coarse_points), first(target.even, 2 * refine.coarse_points)
+    floor = thinned_spacing(jnp.sum(target.even.mask), target.spacing, 2 * refine.coarse_points)
+    return anneal(few, more, start, reach, floor, iterations=refine.coarse_iterations), floor
 
 
 def anneal(
@@ -123,7 +124,7 @@ def anneal(
 
 
 def settle_thinned(refine: ICP, source: Prepared, target: Prepared, start: Rigid, width: Array) -> tuple[Rigid, Array]:
-    """The transform and the width after the second stage of two large clouds, thinned: a start for the whole ones.
+    """The transform and the width after the fine stage of two large clouds, thinned: a start for the whole ones.
 
     Where one of them is not large, they are as they were. Arguments as for ``settle``.
     """
@@ -137,7 +138,7 @@ def settle_thinned(refine: ICP, source: Prepared, target: Prepared, start: Rigid
 
 
 def settle(refine: ICP, source: Prepared, target: Prepared, start: Rigid, width: Array) -> Settled:
-    """The end of the second stage: exact where points have counterparts.
+    """The end of the fine stage: exact where points have counterparts.
 
     Args:
       refine: how to refine.
@@ -156,12 +157,13 @@ def settle(refine: ICP, source: Prepared, target: Prepared, start: Rigid, width:
 
 
 def settled_pose(refine: ICP, source: Prepared, target: Prepared, end: Settled) -> Rigid:
-    """The transform at which the second stage ended, with its derivatives with respect to both clouds and ``refine``.
+    """The transform at which the fine stage ended, with its derivatives with respect to both clouds and ``refine``.
 
     They are exact while correspondences and neighbourhoods hold (implicit function theorem). A normal of fewer than
     three neighbours has no meaning and counts as fixed.
     """
-    surfaces, floor = both(_surface(source), _surface(target)), refine.inlier_distance * coarser(source, target)
+    surfaces, unit = both(_surface(source), _surface(target)), coarser(source, target)
+    floor, plane = jnp.asarray(refine.inlier_distance, unit.dtype) * unit, jnp.asarray(refine.plane, unit.dtype)
     end = jax.lax.stop_gradient(end)
     pairs = find_pairs(jax.lax.stop_gradient(surfaces), end.transform, _SEEN * end.width)
     counted = jnp.isfinite(pairs.squared)
@@ -173,7 +175,7 @@ def settled_pose(refine: ICP, source: Prepared, target: Prepared, end: Settled) 
         weights = robust_weights(squared, end.width * jnp.exp(growth))
         too_wide = growth + jnp.log(end.width) - 0.5 * jnp.log(_squared_width(squared, weights, floor))
         # Both as large as the number of correspondences that count: one damping suits them.
-        return jnp.append(normal_equations(here, weights, refine.plane)[1], jnp.sum(counted) * too_wide)
+        return jnp.append(normal_equations(here, weights, plane)[1], jnp.sum(counted) * too_wide)
 
     return move(root_at_zero(imbalance, 7, end.width)[:6], end.transform)
 
@@ -181,7 +183,7 @@ def settled_pose(refine: ICP, source: Prepared, target: Prepared, end: Settled) 
 def _iterate(
     refine: ICP, surfaces: Surface, start: Rigid, width: Array, unit: Array, tolerance: Any, most: Any
 ) -> _Progress:
-    """The end of the second stage's steps among these surfaces, whose spacing is ``unit``."""
+    """The end of the fine stage's steps among these surfaces, whose spacing is ``unit``."""
 
     def step(fixed: tuple[Surface, Array, Array, Array, Array], now: _Progress) -> _Progress:
         surfaces, unit, inlier_distance, tolerance, plane = fixed

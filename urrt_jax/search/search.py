@@ -4,6 +4,7 @@ Hypotheses come from matched features (``matches.py``), which partial overlap an
 network's landmarks (``model.network.propose``), which sparse and noisy clouds leave alone. Nothing is drawn at random.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from urrt_jax.clouds import Cloud, first, normals, subsample
 from urrt_jax.features import fpfh
 from urrt_jax.model.network import Model, propose
 from urrt_jax.neighbors import coarser_spacing
-from urrt_jax.prepared import Samples
+from urrt_jax.prepared import Samples, coarser
 from urrt_jax.refine.icp import anneal
 from urrt_jax.rigid import Rigid
 from urrt_jax.search.config import Search
@@ -27,9 +28,10 @@ _BRIEF_STEPS, _STEPS = 8, 30
 _NEARLY = 1.5  # inlier distances that a pose may be off before it is refined on the whole subsample
 _QUICK_MATCHES, _QUICK_TRIED = 32, 16  # hypotheses of the quick look, and those of them that are briefly refined
 _ALIKE = 5.0  # degrees between poses that are the same
+_CHEAPER = 0.1  # what turns cost dense clouds, which tell nearly symmetric poses apart better than sparse ones do
 _UNANIMOUSLY = 0.5  # of the confidence that settles it, where most of the hypotheses that were kept end in one pose
 DENSE = 4096
-"""Points of each cloud from which on a quick look is taken first: eight for each that it sees."""
+"""Points of each cloud from which on a quick look is taken first: eight times the 512 of the sample that it sees."""
 
 
 class Found(NamedTuple):
@@ -37,7 +39,7 @@ class Found(NamedTuple):
 
     Attributes:
       transform: source to target; no derivative passes.
-      score: (), in [0, 1]: the mean over both directions of max(0, 1 − d²/r²), r the inlier distance.
+      score: (), in [0, 1]: how well the subsamples' surfaces lie on each other (``Fit.score``).
       width: (), the distance within which the transform can be trusted: the subsample's spacing.
       pending: (), bool, whether a more thorough search is called for.
     """
@@ -58,10 +60,11 @@ def search_quickly(search: Search, source: Samples, target: Samples, plain: Foun
       plain: the pose at hand, which is one more hypothesis.
     """
     source, target, plain = jax.lax.stop_gradient((source, target, plain))
-    few = source.even, target.even
-    guesses = _from_features((source, target), few, search, _QUICK_MATCHES)
-    found, unanimous = _choose([guesses], few, plain.transform, search, _QUICK_TRIED)
-    confidence = fit_samples(*few, found.transform).confidence
+    few, search = (source.even, target.even), _cheaper(search, jnp.array(True))
+    width = coarser(source, target)
+    guesses = _from_features((source, target), few, width, search, _QUICK_MATCHES)
+    found, unanimous = _choose([guesses], few, width, plain.transform, search, _QUICK_TRIED)
+    confidence = fit_samples(*few, found.transform, width).confidence
     settled = (confidence >= search.sure) | (unanimous & (confidence >= _UNANIMOUSLY * search.sure))
     return found._replace(pending=~settled)
 
@@ -79,20 +82,20 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     # It is a choice: derivatives pass through what follows it.
     model, source, target, plain = jax.lax.stop_gradient((model, source, target, plain))
     few = subsample(source.thinned, search.points), subsample(target.thinned, search.points)
-    guesses = []
+    dense = jnp.minimum(*(jnp.sum(each.thinned.mask) for each in (source, target))) >= DENSE
+    width, search, guesses = coarser_spacing(*few), _cheaper(search, dense), []
     if search.matches:
-        guesses.append(_from_features((source, target), few, search, search.matches))
+        guesses.append(_from_features((source, target), few, width, search, search.matches))
     if search.landmarks:
         seen = first(source.even, model.config.points), first(target.even, model.config.points)
         guesses.append(propose(model, *seen, search.landmarks))
-    return _choose(guesses, few, plain.transform, search, search.tried)[0]
+    return _choose(guesses, few, width, plain.transform, search, search.tried)[0]
 
 
 def _choose(
-    guesses: list[Rigid], few: tuple[Cloud, Cloud], plain: Rigid, search: Search, tried: int
+    guesses: list[Rigid], few: tuple[Cloud, Cloud], width: Array, plain: Rigid, search: Search, tried: int
 ) -> tuple[Found, Array]:
     """The best of ``plain`` and all guesses, in three rounds, and whether several guesses end there, ()."""
-    width = coarser_spacing(*few)
     reach = search.inlier_distance * width
     fewer = first(few[0], _COARSE_POINTS), first(few[1], _COARSE_POINTS)
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *guesses)
@@ -105,31 +108,36 @@ def _choose(
     )
     kept, _ = _best(brief, agreement(brief, few, fewer, _NEARLY * reach), search.kept, search)
 
-    # The plain pose is always among those that are refined in full: it stays where none is better by the margin.
+    # The plain pose is always among them, as it is and refined in full: it stays where none fits better.
     kept = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others]), plain, kept)
     full = jax.vmap(lambda pose: anneal(*few, pose, 3 * reach, reach, iterations=_STEPS))(kept)
-    scores = agreement(full, few, few, reach)
-    bonus = jnp.zeros_like(scores).at[0].set(search.margin)
-    poses, best = _best(full, scores, 1, search, bonus)
+    full = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others]), plain, full)
+    # Not their agreement: where little overlaps, more points touch in poses in which surfaces cross.
+    scores = jax.lax.map(lambda pose: fit_samples(*few, pose, width).score, full)
+    poses, best = _best(full, scores, 1, search)
     found = jax.tree.map(lambda leaf, given: jnp.where(best[0] >= 0, leaf[0], given), poses, plain)
-    alike = rigid.rotation_angle(full.rotation[1:], found.rotation) < jnp.deg2rad(_ALIKE)
+    alike = rigid.rotation_angle(full.rotation[2:], found.rotation) < jnp.deg2rad(_ALIKE)
     unanimous = jnp.sum(alike) > 0.5 * alike.shape[0]
     return Found(found, jnp.maximum(best[0], 0.0), width, jnp.array(False)), unanimous
 
 
-def _best(poses: Rigid, scores: Array, count: int, search: Search, bonus: Array | float = 0.0) -> tuple[Rigid, Array]:
+def _best(poses: Rigid, scores: Array, count: int, search: Search) -> tuple[Rigid, Array]:
     """The ``count`` best of H poses and their scores, best first; -1 for those that turn too far."""
     turn = rigid.rotation_angle(poses.rotation, jnp.eye(3)) / jnp.deg2rad(search.max_angle)
     allowed = turn <= 1 + 1e-4
     # With what turns cost, allowed poses are worth -preference at least.
-    worth = jnp.where(allowed, scores + bonus - search.preference * turn**2, -1.0 - search.preference)
+    worth = jnp.where(allowed, scores - search.preference * turn**2, -1.0 - search.preference)
     _, rows = jax.lax.top_k(worth, min(count, len(worth)))
     return jax.tree.map(lambda leaf: leaf[rows], poses), jnp.where(allowed, scores, -1.0)[rows]
 
 
-def _from_features(samples: tuple[Samples, Samples], few: tuple[Cloud, Cloud], search: Search, matches: int) -> Rigid:
-    width = coarser_spacing(*few)
+def _cheaper(search: Search, dense: Array) -> Search:
+    return dataclasses.replace(search, preference=search.preference * jnp.where(dense, _CHEAPER, 1.0))
 
+
+def _from_features(
+    samples: tuple[Samples, Samples], few: tuple[Cloud, Cloud], width: Array, search: Search, matches: int
+) -> Rigid:
     def describe(side: tuple[Cloud, Cloud]) -> Array:
         part, dense = side
         # The clouds are centred: normals point away from the origin.
