@@ -26,13 +26,13 @@ LIMITS = {
 
 
 def measured(name: str) -> list[dict[str, Any]]:
-    """What the tables say of a model: one entry for every protocol and whether the network was alone or refined."""
+    """What the tables say of a model: an entry for each protocol, of the network alone and without a search."""
     suffix = "" if name == DEFAULT else f":{name}"
     entries = []
     for table in TABLES:
         for part in json.loads((HERE / table / "results.json").read_text())["parts"]:
             for row in part["rows"]:
-                if row["method"] in (f"network{suffix}", f"register{suffix}"):
+                if row["method"] in (f"network{suffix}", f"plain{suffix}"):
                     stages = row["method"].removesuffix(suffix) if suffix else row["method"]
                     figures = {figure: float(f"{row[figure]:.6g}") for figure in FIGURES}
                     about = {"protocol": part["protocol"], "data": part["data"], "items": part["items"]}

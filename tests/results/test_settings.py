@@ -26,10 +26,9 @@ def _in_todays_words(identity):
     parts = {}
     for part in ("refine", "search"):
         options = identity[part]
-        if options is not None:
+        if isinstance(options, dict):
             assert all(options[name] == off for name, off in _REMOVED.items() if name in options)
-            kept = {_RENAMED.get(name, name): each for name, each in options.items() if name not in _REMOVED}
-            options = kept
+            options = {_RENAMED.get(name, name): each for name, each in options.items() if name not in _REMOVED}
         parts[part] = options
     return identity | parts
 
