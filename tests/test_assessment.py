@@ -19,7 +19,7 @@ from urrt_jax.assessment import (
     well_posed,
 )
 from urrt_jax.clouds import Cloud, centroid, make_cloud, shift
-from urrt_jax.prepared import Prepared, Sizes
+from urrt_jax.prepared import Prepared, Sizes, coarser
 from urrt_jax.refine import ICP
 from urrt_jax.rigid import Rigid
 
@@ -109,8 +109,10 @@ def test_padding_changes_nothing(cloud):
 def test_fit_of_even_samples_is_that_of_their_prepared_clouds(cloud, degrees):
     """Of clouds that are their own even samples."""
     clouds = [_padded(cloud[:100], 256), _padded(cloud[50:150] + np.float32(0.02), 256)]
-    samples = [_prepared(each).samples.even for each in clouds]
-    found, expected = jax.jit(fit_samples)(*samples, _turn(degrees)), _fit(*clouds, _turn(degrees))
+    samples = [_prepared(each).samples for each in clouds]
+    even = [each.even for each in samples]
+    found = jax.jit(fit_samples)(*even, _turn(degrees), coarser(*samples))
+    expected = _fit(*clouds, _turn(degrees))
     np.testing.assert_allclose(found.shares, expected.shares, atol=1e-6)
     np.testing.assert_allclose(found.uniqueness, expected.uniqueness, atol=1e-4)
     np.testing.assert_allclose(np.sort(found.squared[:100]), np.sort(expected.squared[:100]), rtol=1e-4)

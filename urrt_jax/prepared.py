@@ -105,4 +105,4 @@ def thinned_spacing(count: Array, width: Array, kept: int = THINNED) -> Array:
       width: (), the spacing of the whole cloud.
       kept: how many points the thinned cloud has, at most.
     """
-    return width * jnp.sqrt(jnp.maximum(1.0, count / kept))
+    return width * jnp.sqrt(jnp.maximum(1.0, count / kept)).astype(width.dtype)

@@ -37,7 +37,7 @@ def _at_end(
     """
     pose, width = start, jnp.asarray(how.reach, clouds[0].spacing.dtype)
     if basin:
-        pose, width = _find_basin(how, clouds[0].samples.even, clouds[1].samples.even, start)
+        pose, width = _find_basin(how, clouds[0].samples, clouds[1].samples, start)
     if len(clouds[0].cloud.mask) > THINNED:
         pose, width = _thinned(how, *clouds, pose, width)
     settled = _settle(how, *clouds, pose, width)
@@ -175,7 +175,7 @@ def test_large_clouds_begin_thinned_near_the_answer():
     """Among a quarter of the queries, which is a good start for all of them."""
     dense = _surface(10_000)
     clouds = _ready(dense[::2], dense[1::2] @ TURN.T, _LARGE)
-    pose, width = _find_basin(ICP(), *(each.samples.even for each in clouds), rigid.identity())
+    pose, width = _find_basin(ICP(), *(each.samples for each in clouds), rigid.identity())
     near, narrow = _thinned(ICP(), *clouds, pose, width)
     errors = [float(rotation_degrees(each.rotation, TURN)) for each in (pose, near)]
     assert errors[1] < 0.5 * errors[0]
@@ -194,7 +194,7 @@ def test_clouds_that_are_not_both_large_are_not_thinned():
 def test_without_points_the_first_stage_returns_its_start(surface):
     clouds = _ready(surface, surface)
     start = Rigid(jnp.asarray(TURN, jnp.float32), jnp.ones(3))
-    pose, width = find_basin(ICP(coarse_points=0, reach=0.3), *(each.samples.even for each in clouds), start)
+    pose, width = find_basin(ICP(coarse_points=0, reach=0.3), *(each.samples for each in clouds), start)
     jax.tree.map(np.testing.assert_array_equal, pose, start)
     assert float(width) == np.float32(0.3)
 
@@ -387,7 +387,7 @@ def test_derivatives_of_a_degenerate_cloud_are_finite(shape, angle, x64):
 def _whole(how: ICP, points: jax.Array, source: Cloud, target: Cloud) -> tuple[jax.Array, Settled]:
     """All stages in one trace: the sum of the refined pose, and where they ended."""
     ready = prepare(_SIZES, source._replace(points=points)), prepare(_SIZES, target)
-    pose, width = find_basin(how, ready[0].samples.even, ready[1].samples.even, rigid.identity())
+    pose, width = find_basin(how, ready[0].samples, ready[1].samples, rigid.identity())
     settled = settle(how, *ready, *settle_thinned(how, *ready, pose, width))
     expected = expect(how, *ready, settled)
     pose = differentiable_pose(how, *ready, settled, expected)
@@ -417,7 +417,7 @@ def _stacked(pairs):
 
 def test_vmap_agrees_with_a_loop(ready_pairs):
     def stages(source, target):
-        pose, width = find_basin(ICP(), source.samples.even, target.samples.even, rigid.identity())
+        pose, width = find_basin(ICP(), source.samples, target.samples, rigid.identity())
         return expect(ICP(), source, target, settle(ICP(), source, target, pose, width))
 
     together = jax.jit(jax.vmap(stages))(*_stacked(ready_pairs))
