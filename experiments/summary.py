@@ -22,7 +22,7 @@ PROTOCOLS = (
     ("RPM-Net crops", "beyond", "rpmnet"),
 )
 PAPER = ("3D-URRT (paper)", "C (paper)")
-# As above, and the model that stands in the columns of the network alone and of register.
+# As above, and the model that stands in the columns of the network alone and without a search.
 AGAINST_THE_PAPER = (
     ("clean, as the paper: one step, trained on clean pairs", "table1_ablation", "dcp", ":modelnet40-paper"),
     *((*protocol, "") for protocol in PROTOCOLS[:6]),
@@ -60,7 +60,7 @@ def recalls() -> list[str]:
 
 
 def against_the_paper() -> list[str]:
-    """MAE(R) and MAE(t) of the paper's protocols: its own figures, our network alone and register."""
+    """MAE(R) and MAE(t) of the paper's protocols: its own figures, our network alone, and refined without a search."""
     lines = ["| MAE(R), MAE(t) | the paper's network | ours, network alone | ours, without search | FGR (Open3D) |"]
     lines.append("|---|---:|---:|---:|---:|")
     for head, experiment, protocol, suffix in AGAINST_THE_PAPER:

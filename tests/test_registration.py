@@ -116,6 +116,14 @@ def plain(call, cloud, target) -> Registration:
     return call(cloud, target)
 
 
+def test_the_grid_under_jit_is_that_of_the_dtype_at_hand(x64):
+    """Doubles far from the origin have lost no digits."""
+    far = _MAP[None]
+    for dtype in (np.float32, np.float64):
+        spacing = float(np.spacing(np.abs(far).max().astype(dtype)))
+        assert spacing / 2 <= float(registration._grid(jnp.asarray(far, dtype))) <= 4 * spacing
+
+
 def _same(result, expected, *, atol=1e-4, scale=1.0):
     assert _angle(result.rotation, expected.rotation) < atol
     np.testing.assert_allclose(np.asarray(result.translation) / scale, expected.translation, atol=atol)

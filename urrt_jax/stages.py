@@ -259,14 +259,16 @@ def register_in_frame(
 
     size = source.mask.shape[-1]
 
-    def wanted(flag: Any, *, least: int = 0, often: bool = False) -> bool:
-        """Whether to call a stage that some pairs need, and no pair of fewer than ``least`` points.
+    def wanted(flag: Any, *, least: int = 0, most: int | None = None, often: bool = False) -> bool:
+        """Whether to call a stage that some pairs need, of ``least`` points to ``most``.
 
-        ``often`` says that most of the others need it: it is compiled ahead although ``rare`` is False.
+        ``often`` says that nearly all of these need it: it is compiled ahead although ``rare`` is False.
         """
         if mode == "concrete":
             return bool(np.any(flag))
-        return size >= least and (mode == "traced" or rare or often)
+        if mode == "traced":  # a pair of more rows than ``most`` may have fewer points
+            return size >= least
+        return size >= least and (most is None or size <= rung(most)) and (rare or often)
 
     def when(needed: Any, program: Program, arguments: tuple, otherwise: Any, *, least: int = 0) -> Any:
         """The program's answer for the pairs that need it."""
@@ -300,7 +302,7 @@ def register_in_frame(
         if wanted(thin_first, least=THINNED + 1, often=True):
             pose, width = call(settle_thinned, how, *clouds, pose, width)
         end = last = call(settle, how, *clouds, pose, width)
-        if (mode != "abstract" or size <= rung(how.em_points)) and wanted(end.sparse):
+        if wanted(end.sparse, most=how.em_points):
             last = call(expect, how, *clouds, end)
         pose, settled, steps = last.transform, last.converged, last.iterations
         if mode == "traced":

@@ -394,10 +394,11 @@ def _whole(how: ICP, points: jax.Array, source: Cloud, target: Cloud) -> tuple[j
     return jnp.sum(pose.rotation) + jnp.sum(pose.translation), expected
 
 
-def test_single_precision_stays_so_where_double_precision_is_on(x64):
+@pytest.mark.parametrize("plane", [0.0, 0.97])
+def test_single_precision_stays_so_where_double_precision_is_on(plane, x64):
     cloud = make_cloud(jnp.asarray(_surface(60), jnp.float32))
     gradient, found = jax.eval_shape(
-        functools.partial(jax.grad(_whole, argnums=1, has_aux=True), ICP()), cloud.points, cloud, cloud
+        functools.partial(jax.grad(_whole, argnums=1, has_aux=True), ICP(plane=plane)), cloud.points, cloud, cloud
     )
     floats = (*found.transform, found.width, found.deviations, gradient)
     assert {leaf.dtype for leaf in floats} == {jnp.dtype("float32")}

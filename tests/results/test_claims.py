@@ -98,6 +98,20 @@ def test_search_finds_the_poses_of_real_scans():
 
 def test_no_wrong_pose_of_a_real_scan_is_called_converged():
     assert rows("beyond", "scans")["plain"]["converged_but_off_by_5deg"] == 0
+    assert rows("default_call", "scans")["register"]["converged_but_off_by_5deg"] == 0
+
+
+def test_the_default_call_finds_all_pairs_of_real_scans():
+    assert rows("default_call", "scans")["register"]["recall_5deg_0.05"] == 1
+
+
+def test_the_default_call_is_nowhere_worse_than_without_a_search():
+    for part in load("default_call")["parts"]:
+        plain, default = (next(row for row in part["rows"] if row["method"] == name) for name in ("plain", "register"))
+        for metric in ("angle_mean", "mae_rotation"):
+            assert default[metric] <= plain[metric] + 1e-6, part["title"]  # degrees: batches round otherwise
+        for recall in ("recall_1deg", "recall_5deg_0.1", "recall_5deg_0.05"):
+            assert default[recall] >= plain[recall], part["title"]
 
 
 @pytest.mark.parametrize("pairs", ["all", "all but axisymmetric shapes", "real scans"])

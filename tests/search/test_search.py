@@ -12,10 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from urrt_jax import load_model, register, rigid, stages
+from urrt_jax.assessment import agreement
 from urrt_jax.clouds import make_cloud
 from urrt_jax.frames import normalize_pair
 from urrt_jax.model.network import estimate, propose
-from urrt_jax.prepared import Sizes
+from urrt_jax.prepared import Sizes, coarser
 from urrt_jax.refine import ICP
 from urrt_jax.search import Found, Search
 from urrt_jax.search.search import DENSE, search_thoroughly
@@ -123,7 +124,11 @@ def test_score_of_a_partial_overlap_is_between_zero_and_one(found):
 
 def test_score_of_another_shape_is_lower(find, cloud):
     box = np.random.default_rng(0).uniform(-1, 1, cloud.shape).astype(np.float32)
-    assert float(find(cloud, box).score) < 0.95
+    found, samples = find(cloud, box), _samples(_pad(cloud), _pad(box))
+    assert float(found.score) < 0.95
+    even = tuple(each.even for each in samples)
+    poses = jax.tree.map(lambda leaf: leaf[None], found.transform)
+    assert float(agreement(poses, even, even, 1.5 * coarser(*samples))[0]) < 0.8
 
 
 def test_swapping_the_clouds_inverts_the_transform(find, partial, found):

@@ -76,7 +76,10 @@ class Evaluate:
         self.out.parent.mkdir(parents=True, exist_ok=True)
         figures, failures = {}, {}
         if sys.stderr.isatty() and any(method.batch > 1 for method in methods.values()):
-            print("urrt: ours compile at the first batch, unless an earlier run kept the programs", file=sys.stderr)
+            print(
+                "urrt: our methods compile at their first batch, unless an earlier run kept the programs",
+                file=sys.stderr,
+            )
         for name, method in methods.items():
             save = values_path(self.out.parent / "items", name, method, self.protocol, pairs, items)
             save.parent.mkdir(exist_ok=True)
