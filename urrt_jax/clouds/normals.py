@@ -5,10 +5,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds.cloud import Cloud
-from urrt_jax.loops import largest
 from urrt_jax.rigid import cross
 
-_BLOCK = 8
+_AT_ONCE = 128  # points whose neighbourhoods are summed at once
 _HIGHEST = jax.lax.Precision.HIGHEST
 _SINGULAR = 2e-3  # what rounding, of which arccos makes its root, leaves of a cross product that should vanish
 
@@ -23,62 +22,41 @@ def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array) -
 
     Args:
       points: where.
-      cloud: M points; the loop goes over them once, for all N at a time, so memory is O(N + M).
+      cloud: M points, real ones finite. Memory is O(N + M) without derivatives, O(N·M) with them.
       radius: of the neighbourhood.
       centre: what normals point away from.
     """
-    spread = jnp.moveaxis(_spreads(points, cloud, jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))), -1, 0)
-    normal = jax.vmap(least_axis)(spread)
+    width = jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))
+    normal = jax.vmap(least_axis)(_spreads(points, cloud, width))
     inward = jnp.sum(normal * (points - centre), axis=-1, keepdims=True) < 0
     return jnp.where(inward, -normal, normal)
 
 
-@jax.custom_jvp
 def _spreads(points: Array, cloud: Cloud, radius: Array) -> Array:
-    """The covariances (3, 3, N) of the offsets, in radii, from each point to the cloud's points within the radius."""
-    rows = jnp.arange(1, cloud.points.shape[0] + 1, dtype=jnp.int32)
-    return _accumulate(points, cloud, radius, largest(jnp.max(jnp.where(cloud.mask, rows, 0))))
+    """The covariances (N, 3, 3), in squared radii, of the cloud's points within the radius of each point (N, 3).
 
+    Sums over neighbours are a product of matrices: one tells which points are near, the other holds the moments of each
+    point. Moments are taken about the middle of a few queries, which are near each other where clouds are sorted along
+    a curve: so float32 keeps their digits.
+    """
+    count = points.shape[0]
+    few = min(_AT_ONCE, count)
+    queries = jnp.concatenate([points, jnp.repeat(points[-1:], -count % few, axis=0)]).reshape(-1, few, 3)
 
-@_spreads.defjvp
-def _spreads_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """Reverse mode needs a loop whose length is known: over padding, too."""
-    points, cloud, radius = primals
-    moved, (cloud_moved, _), _ = tangents
-    return jax.jvp(
-        lambda points, others: _accumulate(points, cloud._replace(points=others), radius, None),
-        (points, cloud.points),
-        (moved, cloud_moved),
-    )
+    def some(queries: Array) -> Array:
+        centre = jax.lax.stop_gradient((jnp.min(queries, axis=0) + jnp.max(queries, axis=0)) / 2)
+        at, others = (queries - centre) / radius, (cloud.points - centre) / radius
+        others = jnp.where(cloud.mask[:, None], others, 0.0)
+        squared = sum((at[:, None, k] - others[None, :, k]) ** 2 for k in range(3))
+        near = jax.lax.stop_gradient((cloud.mask & (squared < 1)).astype(points.dtype))
+        x, y, z = others.T
+        moments = jnp.stack([jnp.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
+        return jnp.matmul(near, moments, precision=_HIGHEST)
 
-
-def _accumulate(points: Array, cloud: Cloud, radius: Array, used: Array | None) -> Array:
-    """``_spreads``, of the first ``used`` points of the cloud, () int; of all where it is None."""
-    count = cloud.points.shape[0]
-    block = min(_BLOCK, count)
-    far = ~cloud.mask[:, None] * jnp.finfo(points.dtype).max ** 0.25
-    others = jnp.pad((cloud.points + far) / radius, ((0, -count % block), (0, 0)), constant_values=1e9)
-    others = others.reshape(-1, block, 3)
-    at = points.T / radius
-
-    def visit(sums: tuple[Array, ...], some: Array) -> tuple[Array, ...]:
-        for j in range(block):
-            x, y, z = (some[j, k] - at[k] for k in range(3))
-            near = (x**2 + y**2 + z**2 < 1).astype(points.dtype)
-            x, y, z = near * x, near * y, near * z
-            terms = near, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z
-            sums = tuple(old + term for old, term in zip(sums, terms, strict=True))
-        return sums
-
-    nothing = (jnp.zeros_like(at[0]),) * 10
-    if used is None:
-        (number, *rest), _ = jax.lax.scan(lambda sums, some: (visit(sums, some), None), nothing, others)
-    else:
-        steps = (used + block - 1) // block
-        number, *rest = jax.lax.fori_loop(0, steps, lambda step, sums: visit(sums, others[step]), nothing)
-    x, y, z, xx, xy, xz, yy, yz, zz = (each / jnp.maximum(number, 1) for each in rest)
+    number, *sums = jax.lax.map(some, queries).reshape(-1, 10)[:count].T
+    x, y, z, xx, xy, xz, yy, yz, zz = (each / jnp.maximum(number, 1) for each in sums)
     xx, xy, xz, yy, yz, zz = xx - x * x, xy - x * y, xz - x * z, yy - y * y, yz - y * z, zz - z * z
-    return jnp.stack([jnp.stack(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
+    return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
 
 
 @jax.custom_jvp

@@ -35,7 +35,7 @@ def nearest(
     blocks: Blocks | None = None,
     within: Array | float = jnp.inf,
     distinct: bool = False,
-    block: int | None = 8,
+    block: int | None = 16,
     ordered: bool = False,
     count: Array | None = None,
 ) -> Neighbors:
