@@ -140,6 +140,24 @@ def test_padding_does_not_change_normals(points):
     np.testing.assert_allclose(found[clear], expected[clear], atol=1e-4)
 
 
+@pytest.mark.parametrize("row", [0, -1])
+@pytest.mark.parametrize("far", [1e3, 1e6, np.nan])
+def test_a_stray_query_does_not_change_the_other_normals(points, expected, row, far):
+    cloud = make_cloud(points)
+    among = np.insert(points, row % (len(points) + 1), far, axis=0)
+    found = np.delete(_normals(among, cloud, _RADIUS, centroid(cloud)), row, axis=0)
+    good = _well_determined(points)
+    np.testing.assert_allclose(found[good], expected[good], atol=1e-4)
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_a_stray_point_does_not_change_normals_far_from_it(points, expected, row):
+    among = np.insert(points, row % (len(points) + 1), 1e3, axis=0)
+    found = np.delete(_normals(among, make_cloud(among), _RADIUS, points.mean(axis=0)), row, axis=0)
+    good = _well_determined(points)
+    np.testing.assert_allclose(found[good], expected[good], atol=1e-4)
+
+
 def test_vmap_agrees_with_a_loop():
     clouds = np.stack([_sphere(80) * scale for scale in (1.0, 0.9, 0.8)]).astype(np.float32)
     together = jax.vmap(lambda p: normals(p, make_cloud(p), 0.6, jnp.zeros(3)))(clouds)

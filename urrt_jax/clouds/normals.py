@@ -26,8 +26,8 @@ def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array) -
       radius: of the neighbourhood.
       centre: what normals point away from.
     """
-    width = jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))
-    normal = jax.vmap(least_axis)(_spreads(points, cloud, width))
+    radius = jax.lax.stop_gradient(jnp.asarray(radius, points.dtype))
+    normal = jax.vmap(least_axis)(_spreads(points, cloud, radius))
     inward = jnp.sum(normal * (points - centre), axis=-1, keepdims=True) < 0
     return jnp.where(inward, -normal, normal)
 
@@ -41,10 +41,13 @@ def _spreads(points: Array, cloud: Cloud, radius: Array) -> Array:
     """
     count = points.shape[0]
     few = min(_AT_ONCE, count)
-    queries = jnp.concatenate([points, jnp.repeat(points[-1:], -count % few, axis=0)]).reshape(-1, few, 3)
+    # Mirrored at the end, so that what fills the last few up is near them.
+    queries = jnp.pad(points, ((0, -count % few), (0, 0)), mode="reflect").reshape(-1, few, 3)
 
     def some(queries: Array) -> Array:
-        centre = jax.lax.stop_gradient((jnp.min(queries, axis=0) + jnp.max(queries, axis=0)) / 2)
+        # Between their quartiles: a stray query, far away or not finite, hardly moves it.
+        in_order = jnp.sort(jax.lax.stop_gradient(queries), axis=0)
+        centre = (in_order[few // 4] + in_order[-1 - few // 4]) / 2
         at, others = (queries - centre) / radius, (cloud.points - centre) / radius
         others = jnp.where(cloud.mask[:, None], others, 0.0)
         squared = sum((at[:, None, k] - others[None, :, k]) ** 2 for k in range(3))
