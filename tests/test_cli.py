@@ -81,7 +81,7 @@ def test_json_is_one_object_with_exactly_the_promised_keys(files, capsys):
     assert register(files, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     promised = "matrix rotation translation fitness rmse overlap confidence converged reason information"
-    assert list(found) == promised.split()
+    assert list(found) == [*promised.split(), "covariance", "alternatives"]
     matrix = np.array(found["matrix"])
     np.testing.assert_array_equal(matrix[:3, :3], found["rotation"])
     np.testing.assert_array_equal(matrix[:3, 3], found["translation"])
@@ -89,9 +89,10 @@ def test_json_is_one_object_with_exactly_the_promised_keys(files, capsys):
     assert isinstance(found["fitness"], float) and isinstance(found["rmse"], float)
     assert isinstance(found["converged"], bool)
     assert len(found["overlap"]) == 2 and np.shape(found["information"]) == (6, 6)
+    assert np.shape(found["covariance"]) == (6, 6) and isinstance(found["alternatives"], list)
 
 
-@pytest.mark.parametrize("field", ["fitness", "rmse", "overlap", "confidence", "information"])
+@pytest.mark.parametrize("field", ["fitness", "rmse", "overlap", "confidence", "information", "covariance"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_json_has_null_for_a_number_that_is_not_finite(registration, field, value):
     whole = np.asarray(getattr(registration, field))

@@ -774,7 +774,7 @@ def test_every_outcome_is_told_in_words_of_its_own(call, cloud, target):
         Outcome.DEGENERATE: "one line",
         Outcome.UNSETTLED: "iterations",
         Outcome.MISFIT: "do not lie on each other",
-        Outcome.AMBIGUOUS: "symmetric",
+        Outcome.AMBIGUOUS: "another pose fits",
         Outcome.DIGITS: "float32",
     }
     for outcome, result in found.items():
@@ -784,7 +784,8 @@ def test_every_outcome_is_told_in_words_of_its_own(call, cloud, target):
 
 def test_every_outcome_has_a_reason_and_a_batch_has_one_each(plain):
     codes = jnp.array([int(outcome) for outcome in Outcome])
-    reasons = dataclasses.replace(plain, outcome=codes).reason
+    batch = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(codes), *np.shape(leaf))), plain)
+    reasons = dataclasses.replace(batch, outcome=codes).reason
     assert len(set(reasons)) == len(Outcome) and all(reasons)
     assert reasons[0] == plain.reason == "converged"
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from urrt_jax.result import Outcome, Registration
+from urrt_jax.result import OtherPoses, Outcome, Registration
 from urrt_jax.rigid import Rigid
 from urrt_jax.viewer import plot_registration, region_colors, show_registration
 
@@ -27,6 +27,8 @@ def registration(source: np.ndarray, target: np.ndarray, *, converged: bool = Tr
         outcome=jnp.array(Outcome.CONVERGED if converged else Outcome.MISFIT, jnp.int32),
         correspondences=jnp.zeros(len(source), jnp.int32),
         information=jnp.eye(6),
+        covariance=jnp.eye(6),
+        alternatives=OtherPoses(jnp.eye(3)[None], jnp.zeros((1, 3)), jnp.zeros(1)),
         source_regions=jnp.asarray(octants[0]),
         target_regions=jnp.asarray(octants[1]),
         coarse=Rigid(jnp.eye(3), jnp.zeros(3)),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from urrt_jax.program_cache import use_compilation_cache
     from urrt_jax.refine import ICP
     from urrt_jax.registration import register
-    from urrt_jax.result import Outcome, Registration
+    from urrt_jax.result import OtherPoses, Outcome, Registration
     from urrt_jax.search import Search
     from urrt_jax.warm_up import warm_up
     from urrt_jax.weights import available_models, load_model, model_card, save_model
@@ -25,6 +25,7 @@ __all__ = [
     "ICP",
     "Model",
     "ModelConfig",
+    "OtherPoses",
     "Outcome",
     "Registration",
     "Registrations",
@@ -46,6 +47,7 @@ _HOMES = {
     "ICP": "urrt_jax.refine",
     "Model": "urrt_jax.model",
     "ModelConfig": "urrt_jax.model",
+    "OtherPoses": "urrt_jax.result",
     "Outcome": "urrt_jax.result",
     "Registration": "urrt_jax.result",
     "Registrations": "urrt_jax.batches",

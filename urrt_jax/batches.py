@@ -10,13 +10,14 @@ import numpy as np
 from jax.typing import ArrayLike
 from tqdm import tqdm
 
+from urrt_jax.assessment.alternatives import KEPT
 from urrt_jax.checks import check_whole
 from urrt_jax.clouds import check_cloud
 from urrt_jax.host import PairOnHost
 from urrt_jax.model.network import Model
 from urrt_jax.refine import ICP
 from urrt_jax.registration import check_options, check_rigid, make_options, register_on_host, start_compiling
-from urrt_jax.result import Outcome, Registration
+from urrt_jax.result import OtherPoses, Outcome, Registration
 from urrt_jax.rigid import Rigid
 from urrt_jax.search import Search
 from urrt_jax.stages import Options, register_in_frame, rung
@@ -225,6 +226,7 @@ def _refused(source: int, target: int) -> Registration:
     zero: Any = np.float32(0.0)
     turn: Any = np.eye(3, dtype=np.float32)
     shift: Any = np.zeros(3)
+    others: Any = np.broadcast_to(turn, (KEPT, 3, 3)), np.zeros((KEPT, 3)), np.zeros(KEPT, np.float32)
     fields: dict[str, Any] = dict(
         rotation=turn,
         translation=shift,
@@ -237,6 +239,8 @@ def _refused(source: int, target: int) -> Registration:
         outcome=np.int32(Outcome.REFUSED),
         correspondences=np.full(source, -1, np.int32),
         information=np.zeros((6, 6)),
+        covariance=np.diag(np.full(6, np.inf)),
+        alternatives=OtherPoses(*others),
         source_regions=np.zeros(source, np.int32),
         target_regions=np.zeros(target, np.int32),
         coarse=Rigid(turn, shift),

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from urrt_jax.assessment import moved_information
+from urrt_jax.assessment import moved_covariance, moved_information
 from urrt_jax.clouds import Cloud
 from urrt_jax.clouds.cloud import FARTHEST
 from urrt_jax.frames import normalize_on_host
-from urrt_jax.result import Registration
+from urrt_jax.result import OtherPoses, Registration
 from urrt_jax.rigid import Rigid
 from urrt_jax.stages import Outputs, Told
 
@@ -78,12 +78,17 @@ class PairOnHost:
         return clouds[0], clouds[1], self.told
 
     def restore(self, outputs: Outputs) -> Registration:
-        """The result, as NumPy arrays, in the user's frame and rows; translations and information are float64."""
+        """The result, as NumPy arrays, in the user's frame and rows; float64 where it depends on an origin."""
         scale, report = self.frame.scale, outputs.report
-        poses = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), (outputs.transform, outputs.coarse))
-        pose, coarse = (self._rounded(self.frame.leave(each)) for each in poses)
+        *alternatives, weight = report.alternatives
+        poses = outputs.transform, outputs.coarse, Rigid(*alternatives)
+        poses = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), poses)
+        pose, coarse, others = (self._rounded(self.frame.leave(each)) for each in poses)
         stretch = np.array([1.0, 1.0, 1.0, scale, scale, scale])
         matrix: Any = np.asarray(report.information, np.float64) * stretch * stretch[:, None]
+        units = stretch[::-1]
+        covariance: Any = np.asarray(report.covariance, np.float64) * units * units[:, None]
+        center = np.asarray(self.frame.target_center)
         found = report.correspondences[: len(self._points[0])]
         if self._rows[1] is not None:
             found = np.where(found >= 0, self._rows[1][found], -1)
@@ -102,7 +107,9 @@ class PairOnHost:
             converged=np.asarray(report.converged),  # type: ignore[arg-type]
             outcome=np.asarray(report.outcome),  # type: ignore[arg-type]
             correspondences=self._in_given_rows(found, 0, -1),
-            information=moved_information(matrix, np.asarray(self.frame.target_center)),
+            information=moved_information(matrix, center),
+            covariance=moved_covariance(covariance, center),
+            alternatives=OtherPoses(*others, plain(weight)),
             source_regions=self._in_given_rows(outputs.source_regions, 0, 0),
             target_regions=self._in_given_rows(outputs.target_regions, 1, 0),
             coarse=coarse,

@@ -11,20 +11,21 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from urrt_jax import rigid
-from urrt_jax.assessment import moved_information
+from urrt_jax.assessment import moved_covariance, moved_information
 from urrt_jax.clouds import Cloud, check_cloud, first, make_cloud
 from urrt_jax.frames import Frame, normalize_pair
 from urrt_jax.host import PairOnHost, abstract_pair, is_exact
 from urrt_jax.model.network import Model
 from urrt_jax.programs import compile_ahead
 from urrt_jax.refine import ICP
-from urrt_jax.result import Registration
+from urrt_jax.result import OtherPoses, Registration
 from urrt_jax.rigid import Rigid
 from urrt_jax.search import Search
 from urrt_jax.stages import STEPS_BEFORE_REFINEMENT, Options, Outputs, Told, register_in_frame, rung
 from urrt_jax.weights import load_model
 
 _AUTO_PREFERENCE = 0.2  # chosen on training shapes, cropped and noisy ones among them, and on bunny pairs
+_HIGHEST = jax.lax.Precision.HIGHEST
 _UNEVEN = 1e-3  # what the entries of R Rᵀ may be off the identity's
 
 
@@ -131,10 +132,12 @@ def _register_arrays(
     cast = jax.tree.map(lambda leaf: leaf.astype(pair.dtype) if leaf.dtype == np.float64 else leaf, result)
     device = jax.device_put(cast)  # jnp.asarray compiles a small program for each new shape
     if any(is_exact(points) for points in (source, target)):
-        coarse = device.coarse._replace(translation=result.coarse.translation)
-        return dataclasses.replace(
-            device, translation=result.translation, information=result.information, coarse=coarse
-        )
+        exact = ("translation", "information", "covariance")
+        nested = {
+            name: getattr(device, name)._replace(translation=getattr(result, name).translation)
+            for name in ("coarse", "alternatives")
+        }
+        return dataclasses.replace(device, **{name: getattr(result, name) for name in exact}, **nested)
     return device
 
 
@@ -206,8 +209,12 @@ def _leave(frame: Frame, outputs: Outputs) -> Registration:
     """The result in the user's coordinates, under a trace (``PairOnHost.restore`` on arrays)."""
     scale, report = frame.scale, outputs.report
     pose, coarse = frame.leave(outputs.transform), frame.leave(outputs.coarse)
+    *others, weight = report.alternatives
+    alternatives = OtherPoses(*frame.leave(Rigid(*others)), weight)
     stretch = jnp.concatenate([jnp.ones(3, scale.dtype), jnp.full(3, scale)])
     matrix = moved_information(report.information * stretch * stretch[:, None], frame.target_center)
+    units = stretch[::-1]
+    covariance = moved_covariance(report.covariance * units * units[:, None], frame.target_center)
     lengths = {name: getattr(report, name) * scale for name in ("rmse", "inlier_distance")}
     return Registration(
         rotation=pose.rotation,
@@ -216,7 +223,13 @@ def _leave(frame: Frame, outputs: Outputs) -> Registration:
         source_regions=outputs.source_regions,
         target_regions=outputs.target_regions,
         steps=jnp.asarray(outputs.steps),
-        **{**report._asdict(), **lengths, "information": matrix},
+        **{
+            **report._asdict(),
+            **lengths,
+            "information": matrix,
+            "covariance": covariance,
+            "alternatives": alternatives,
+        },
     )
 
 
@@ -258,14 +271,18 @@ def _from_origins(result: Registration, source: np.ndarray | None, target: np.nd
         return result
     origin_in, origin_out = (np.zeros(3) if origin is None else origin for origin in (source, target))
 
-    def shifted(pose: Rigid) -> Array:
-        return pose.translation + (origin_out - rigid.rotate(pose.rotation, jnp.asarray(origin_in, jnp.float32)))
+    def shifted(pose: Registration | Rigid | OtherPoses) -> Array:
+        return pose.translation + (
+            origin_out - jnp.matmul(pose.rotation, jnp.asarray(origin_in, jnp.float32), precision=_HIGHEST)
+        )
 
     return dataclasses.replace(
         result,
-        translation=shifted(Rigid(result.rotation, result.translation)),
+        translation=shifted(result),
         coarse=result.coarse._replace(translation=shifted(result.coarse)),
+        alternatives=result.alternatives._replace(translation=shifted(result.alternatives)),
         information=moved_information(result.information, origin_out),
+        covariance=moved_covariance(result.covariance, origin_out),
     )
 
 

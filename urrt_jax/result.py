@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ class Outcome(enum.IntEnum):
     MISFIT = 5
     AMBIGUOUS = 6
     REFUSED = 7
+    UNDETERMINED = 8
 
 
 _REASONS = {
@@ -35,9 +37,43 @@ _REASONS = {
     "origin before you convert",
     Outcome.UNSETTLED: "refinement did not come to rest within its iterations",
     Outcome.MISFIT: "the surfaces do not lie on each other, or too little of them does to tell",
-    Outcome.AMBIGUOUS: "another pose fits about as well: the shape is symmetric, or nearly so",
+    Outcome.AMBIGUOUS: "another pose fits about as well",
+    Outcome.UNDETERMINED: "too few points touch, or they are too noisy, to determine the pose",
     Outcome.REFUSED: "the clouds or the initial transform are not what register takes",
 }
+
+
+class OtherPoses(NamedTuple):
+    """K other poses in which the clouds lie on each other, best first; K is 4, and those that are none weigh nothing.
+
+    Attributes:
+      rotation: (K, 3, 3).
+      translation: (K, 3), in the input's units.
+      weight: (K,), in [0, 1], how probable each is, if it is certain that one of them or the pose itself is right: what
+        is missing from 1 is the weight of the pose itself.
+    """
+
+    rotation: Array
+    translation: Array
+    weight: Array
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The homogeneous matrices (..., 4, 4), NumPy float64."""
+        top = np.concatenate([self.rotation, np.asarray(self.translation, np.float64)[..., None]], axis=-1)
+        bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*top.shape[:-2], 1, 4))
+        return np.concatenate([top, bottom], axis=-2)
+
+    def likely(self, weight: float = 0.01) -> list[tuple[np.ndarray, float]]:
+        """Matrix (4, 4) and weight of those that weigh at least this much, of one pair.
+
+        Raises:
+          ValueError: these are the poses of a batch.
+        """
+        if np.ndim(self.weight) != 1:
+            raise ValueError(f"expected the poses of one pair, got weights of shape {np.shape(self.weight)}")
+        every = zip(self.matrix, np.asarray(self.weight).tolist(), strict=True)
+        return [(matrix, each) for matrix, each in every if each >= weight]
 
 
 @jax.tree_util.register_dataclass
@@ -56,9 +92,9 @@ class Registration:
       inlier_distance: (), the distance that was used, in the input's units.
       overlap: (2,), the share of the source's points that lie within 1.5 spacings (the coarser cloud's) of the target,
         and of the target's (up to 4096 of them) that lie as near the source.
-      confidence: (), in [0, 1]: how sure it is that the surfaces lie on each other rather than cross, and that they do
-        so in no other pose. Learned on training shapes, from overlap, from distances, and from how much worse the
-        clouds agree after quarter and half turns. Low for symmetric shapes.
+      confidence: (), in [0, 1]: how sure it is that the rotation is right within 5°: that surfaces lie on each other
+        rather than cross, that no other pose fits as well, and that the points are enough to determine the pose. The
+        product of these three, each learned on training shapes. Low for symmetric shapes and for few points.
       converged: (), bool: the input was finite, not collinear, and not so far from the origin that float32 lost its
         digits; refinement came to rest within its iterations (where there was refinement); and the confidence is at
         least 0.5.
@@ -67,6 +103,11 @@ class Registration:
         within ``inlier_distance``.
       information: (6, 6), of the pose, from these correspondences: Σ GᵀG, G = [I, −[q]×] at target points q, for small
         motions (translation, rotation vector) about the target's origin; what pose graphs take (Choi et al. 2015).
+      covariance: (6, 6), of the pose, for the same motions, in squared units and squared radians: how far noise and
+        sampling may have moved it, as the distances along normals show. It knows nothing of other poses. Motions that
+        nothing holds have a large variance, not an infinite one; where a pose can't be determined at all it is the
+        clouds' radius and π, squared.
+      alternatives: other poses that fit, with weights; for a symmetric shape some of those that look alike.
       source_regions: (N,) int32, the network's region of every source point; 0 for padding, and for a network
         without regions (model A).
       target_regions: (M,) int32, the same for the target.
@@ -86,6 +127,8 @@ class Registration:
     outcome: Array
     correspondences: Array
     information: Array
+    covariance: Array
+    alternatives: OtherPoses
     source_regions: Array
     target_regions: Array
     coarse: Rigid
@@ -94,8 +137,10 @@ class Registration:
     @property
     def reason(self) -> str | list[str]:
         """Why ``converged`` is False, in words, or "converged"; of a batch, a list. Not under a trace."""
-        codes = np.asarray(self.outcome)
-        return _REASONS[Outcome(int(codes))] if codes.ndim == 0 else [_REASONS[Outcome(int(code))] for code in codes]
+        if np.ndim(self.outcome) == 0:
+            return _in_words(self)
+        results = jax.tree.map(np.asarray, self)
+        return [_in_words(jax.tree.map(lambda leaf, row=row: leaf[row], results)) for row in range(len(self.outcome))]
 
     @property
     def matrix(self) -> Array:
@@ -118,3 +163,22 @@ class Registration:
             turn = np.swapaxes(np.asarray(self.rotation, np.float64), -1, -2)
             return np.asarray(points, np.float64) @ turn + shift  # type: ignore[return-value]
         return rigid.rotate(self.rotation, jnp.asarray(points)) + shift
+
+
+def _in_words(result: Registration) -> str:
+    """The reason of one pair."""
+    from scipy.spatial.transform import Rotation
+
+    outcome = Outcome(int(result.outcome))
+    reason = _REASONS[outcome]
+    if outcome == Outcome.AMBIGUOUS:
+        turn = Rotation.from_matrix(np.asarray(result.alternatives.rotation[0]) @ np.asarray(result.rotation).T)
+        angle = turn.magnitude()
+        axis = ", ".join(f"{value:.2f}" for value in turn.as_rotvec() / max(angle, 1e-9))
+        return f"{reason}: turned by {np.rad2deg(angle):.0f}° about the direction ({axis})"
+    if outcome == Outcome.UNDETERMINED:
+        deviation = np.rad2deg(np.sqrt(np.trace(np.asarray(result.covariance)[3:, 3:])))
+        return (
+            f"{reason}: the standard deviation of its rotation is {deviation:.1f}°" if 2 < deviation < 180 else reason
+        )
+    return reason

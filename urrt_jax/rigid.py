@@ -4,6 +4,7 @@ Rotations act on columns from the left: ``target ≈ rotation @ source + transla
 rotation runs at ``Precision.HIGHEST``: TF32 would move points of a unit cube by 4e-4.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import chex
@@ -152,8 +153,10 @@ def quick_rotation(moment: Array) -> Array:
     moment = moment / jnp.maximum(jnp.sqrt(jnp.sum(moment**2)), 1e-6)
     trace, symmetric = jnp.trace(moment), moment + moment.T
     turn = jnp.stack([moment[2, 1] - moment[1, 2], moment[0, 2] - moment[2, 0], moment[1, 0] - moment[0, 1]])
-    power = jnp.block([[trace, turn], [turn[:, None], symmetric - trace * jnp.eye(3)]])
-    power = power + 2 * jnp.eye(4)  # eigenvalues are within √3 of zero: the first becomes the largest in size
+    power = jnp.block([[trace, turn], [turn[:, None], symmetric - trace * jnp.eye(3, dtype=moment.dtype)]])
+    power = power + 2 * jnp.eye(
+        4, dtype=moment.dtype
+    )  # eigenvalues are within √3 of zero: the first becomes the largest in size
 
     def square(_: int, power: Array) -> Array:
         power = jnp.sum(power[:, :, None] * power[None], axis=1)
@@ -172,7 +175,14 @@ def quick_rotation(moment: Array) -> Array:
     )
 
 
-def procrustes(source: Array, target: Array, weights: Array, *, stiffness: float = 0.0) -> Rigid:
+def procrustes(
+    source: Array,
+    target: Array,
+    weights: Array,
+    *,
+    stiffness: float = 0.0,
+    turn: Callable[[Array], Array] = nearest_rotation,
+) -> Rigid:
     """The rigid transform that minimises Σ wᵢ ‖R sᵢ + t − tᵢ‖² (Kabsch 1976; Umeyama 1991 without scale).
 
     Args:
@@ -181,6 +191,7 @@ def procrustes(source: Array, target: Array, weights: Array, *, stiffness: float
       weights: (N,) non-negative; zero leaves a pair out, and an all-zero vector gives the identity.
       stiffness: a small area that is added to the moment's diagonal: pairs that spread over less than it, in any
         direction, are not turned about the others.
+      turn: what makes the rotation of the moment: ``nearest_rotation`` or ``quick_rotation``.
     """
     chex.assert_equal_shape([source, target])
     chex.assert_shape(weights, source.shape[:1])
@@ -190,6 +201,6 @@ def procrustes(source: Array, target: Array, weights: Array, *, stiffness: float
     target_mean = jnp.matmul(share, target, precision=_HIGHEST)
     moment = jnp.einsum("n,ni,nj->ij", share, target - target_mean, source - source_mean, precision=_HIGHEST)
     still = jnp.eye(3, dtype=moment.dtype)
-    rotation = nearest_rotation(jnp.where(total > 0, moment + stiffness * still, still))
+    rotation = turn(jnp.where(total > 0, moment + stiffness * still, still))
     translation = jnp.where(total > 0, target_mean - rotate(rotation, source_mean), jnp.zeros_like(target_mean))
     return Rigid(rotation, translation)

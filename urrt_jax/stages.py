@@ -4,9 +4,9 @@
 another. On arrays it reads from each result whether a rare stage is needed, and runs (and compiles) it only then. Under
 a trace the same stages are composed, and rare ones become loops that only run for pairs which need them.
 
-Network, search and the coarse stage of refinement see samples of fixed size: they are compiled once, whatever the
-clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole clouds and are compiled for each rung of the ladder,
-as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
+Network, search, the coarse stage of refinement and ``compare`` see samples of fixed size: they are compiled once,
+whatever the clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole clouds and are compiled for each rung
+of the ladder, as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
 
 The *plain pose* is what registration has before any search: the network's estimate, or the user's initial transform
 where that fits better, after the coarse stage of refinement.
@@ -21,7 +21,20 @@ from jax import Array
 from jax.core import Tracer
 
 from urrt_jax import prepared, refine, rigid, search
-from urrt_jax.assessment import agreement, fit, fit_samples, information, inlier_share, well_posed
+from urrt_jax.assessment import (
+    Alternatives,
+    agreement,
+    confidence,
+    find_alternatives,
+    fit,
+    fit_samples,
+    information,
+    inlier_share,
+    measure,
+    odds,
+    precision,
+    well_posed,
+)
 from urrt_jax.clouds import Cloud, first
 from urrt_jax.loops import where_needed
 from urrt_jax.model.encoding import Encoding
@@ -30,7 +43,7 @@ from urrt_jax.model.network import estimate as apply_network
 from urrt_jax.prepared import THINNED, Prepared, Samples, Sizes
 from urrt_jax.programs import Program
 from urrt_jax.refine import ICP, find_basin
-from urrt_jax.result import Outcome
+from urrt_jax.result import OtherPoses, Outcome
 from urrt_jax.rigid import Rigid
 from urrt_jax.search import Found, Search
 
@@ -38,13 +51,14 @@ STEPS_BEFORE_REFINEMENT = 2
 """Steps of the network, at most, where refinement follows, which does the rest."""
 _SMALLEST_RUNG, _FACTOR = 256, 4
 _SAMPLE = 512  # points of the even subsample, at least
-# The logit of the plain pose's fit on the subsample (``Fit.surfaces``) below which a search is called for, and below
-# which a pose that is not sure counts as a misfit rather than as ambiguous. Dense clouds are searched more readily,
-# because their quick look is cheap and seldom wrong. Chosen on training shapes and bunny pairs.
-_FITS, _FITS_DENSE = -0.5, 0.2
+# The score of the plain pose on the subsample (``Fit.score``) below which a search is called for. Dense clouds are
+# searched more readily, because their quick look is cheap and seldom wrong. Chosen on training shapes and bunny pairs.
+_FITS, _FITS_DENSE = 0.80, 0.87
 _COARSE_GRID, _LOST_GRID = 0.1, 1.0
 """The step between float32 coordinates, in spacings, from which on lost digits explain a failure, and from which on no
 result is trusted: then neighbouring points have fallen together. Guesses."""
+_FEWEST = 3  # correspondences; fewer say nothing of the covariance
+_UNKNOWN = (1.0,) * 3 + (np.pi**2,) * 3  # the covariance of what is not known, in squared radii and radians
 _SEARCHED_AT_ONCE = 2  # pairs of a batch
 
 
@@ -102,6 +116,8 @@ class Report(NamedTuple):
     outcome: Array
     correspondences: Array
     information: Array
+    covariance: Array
+    alternatives: OtherPoses
 
 
 class Options(NamedTuple):
@@ -176,13 +192,25 @@ def approach(
     glance = fit_samples(source.even, target.even, transform, prepared.coarser(source, target))
     fewer = jnp.minimum(*counts)
     dense = fewer >= search.DENSE
-    pending = jnp.asarray(always) | (glance.surfaces < jnp.where(dense, _FITS_DENSE, _FITS))
+    pending = jnp.asarray(always) | (glance.score < jnp.where(dense, _FITS_DENSE, _FITS))
     return Plan(Found(transform, jnp.zeros_like(width), width, pending), pending & dense, fewer > THINNED)
 
 
 @Program
+def compare(_: None, source: Samples, target: Samples, transform: Rigid) -> Alternatives:
+    """Other poses that fit about as well. The first argument is shared by the pairs of a batch; here it is nothing."""
+    return find_alternatives(source, target, transform)
+
+
+@Program
 def assess(
-    refined: bool | Array, source: Prepared, target: Prepared, transform: Rigid, settled: Array, told: Told
+    refined: bool | Array,
+    source: Prepared,
+    target: Prepared,
+    transform: Rigid,
+    settled: Array,
+    others: Alternatives,
+    told: Told,
 ) -> Report:
     """What is to be said of a transform."""
     found = fit(source, target, transform, told.inlier_distance)
@@ -195,8 +223,12 @@ def assess(
     inlier = source.cloud.mask & (squared <= reach**2)
     rows = jnp.where(inlier, target.rows[found.nearest], -1)
     determined = well_posed(source.cloud) & well_posed(target.cloud) & jnp.all(jnp.isfinite(transform.translation))
-    confidence = jnp.where(determined & told.initial_is_finite, found.confidence, 0.0)
-    sure = confidence >= 0.5
+    precise = precision(source, target, transform)
+    measured = measure(found, others, precise)
+    checks = confidence(measured)
+    usable = determined & told.initial_is_finite & jnp.all(jnp.isfinite(measured))
+    total = jnp.where(usable, checks.total, 0.0)
+    sure, least = total >= 0.5, jnp.argmin(jnp.stack(checks))
     lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * prepared.coarser(source, target)
     # In order of precedence; the first that holds is the outcome.
     outcomes = {
@@ -205,20 +237,28 @@ def assess(
         Outcome.DIGITS: told.grid > lost,
         Outcome.UNSETTLED: jnp.asarray(refined) & ~settled,
         Outcome.CONVERGED: sure,
-        Outcome.AMBIGUOUS: found.surfaces >= _FITS,
-        Outcome.MISFIT: jnp.array(True),
+        Outcome.MISFIT: (checks.surfaces < 0.5) | (least == checks._fields.index("surfaces")),
+        Outcome.AMBIGUOUS: least == checks._fields.index("unique"),
+        Outcome.UNDETERMINED: jnp.array(True),
     }
     outcome = jnp.select(list(outcomes.values()), [jnp.int32(each) for each in outcomes])
+    against = jnp.where(usable, odds(others), 0.0)
     return Report(
         fitness=fitness,
         rmse=rmse,
         inlier_distance=reach,
         overlap=found.overlap,
-        confidence=confidence,
+        confidence=total,
         converged=outcome == Outcome.CONVERGED,
         outcome=outcome,
         correspondences=jnp.zeros_like(rows).at[source.rows].set(rows),
         information=information(nearest, inlier),
+        covariance=jnp.where(
+            usable & (precise.pairs > _FEWEST),
+            precise.covariance,
+            jnp.diag(jnp.array(_UNKNOWN, precise.covariance.dtype)),
+        ),
+        alternatives=OtherPoses(*others.poses, against / (1 + jnp.sum(against))),
     )
 
 
@@ -307,7 +347,8 @@ def register_in_frame(
         pose, settled, steps = last.transform, last.converged, last.iterations
         if mode == "traced":
             pose = refine.differentiable_pose(how, *clouds, end, last)
-    report = call(assess, how is not None, *clouds, pose, settled, told)
+    others = call(compare, None, *samples, pose)
+    report = call(assess, how is not None, *clouds, pose, settled, others, told)
     return Outputs(
         transform=pose,
         coarse=start.coarse,

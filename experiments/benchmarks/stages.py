@@ -35,7 +35,7 @@ from urrt_jax.model.encoding import encode_cloud
 from urrt_jax.model.landmarks import place_landmarks
 from urrt_jax.programs import Program
 from urrt_jax.registration import make_options
-from urrt_jax.stages import approach, assess, estimate, expect, label, prepare, rung, settle, sizes_of
+from urrt_jax.stages import approach, assess, compare, estimate, expect, label, prepare, rung, settle, sizes_of
 
 HERE = Path(__file__).parent
 BATCH = 32
@@ -92,6 +92,7 @@ def measure(data: str) -> dict:
     found = approach.batched(*looked).found
     settled = settle.batched(refine, *ready, found.transform, found.width)
     last = expect.batched(refine, *ready, settled)
+    others = compare.batched(None, *samples, last.transform)
 
     def took(program: Program, *inputs: Any) -> float:
         return 1e3 * median_seconds(lambda: jax.block_until_ready(program.batched(*inputs)), 7) / BATCH
@@ -111,7 +112,8 @@ def measure(data: str) -> dict:
         "refine on samples": took(approach, *looked),
         "refine on whole clouds": took(settle, refine, *ready, found.transform, found.width),
         "EM-ICP, for the pairs that need it": took(expect, refine, *ready, settled),
-        "assess": took(assess, True, *ready, last.transform, last.converged, told),
+        "compare with other poses": took(compare, None, *samples, last.transform),
+        "assess": took(assess, True, *ready, last.transform, last.converged, others, told),
         "regions of both clouds": took(label, model, ready[0], start.seen, start.source)
         + took(label, model, ready[1], start.still, start.target),
         "register": 1e3 * median_seconds(whole, 7) / BATCH,

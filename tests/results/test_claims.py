@@ -114,10 +114,40 @@ def test_the_default_call_is_nowhere_worse_than_without_a_search():
             assert default[recall] >= plain[recall], part["title"]
 
 
-@pytest.mark.parametrize("pairs", ["all", "all but axisymmetric shapes", "real scans"])
-def test_confidence_separates_right_poses_from_wrong_ones(pairs):
-    area = {row["pairs_of"]: row["auc"] for row in load("confidence")["rows"]}
-    assert area[pairs] >= 0.95
+_HONEST = load("confidence")
+
+
+@pytest.mark.parametrize("row", _HONEST["by_points"], ids=lambda row: row["pairs_of"])
+def test_few_of_the_poses_called_converged_are_wrong_at_any_number_of_points(row):
+    assert row["called"] >= 50
+    assert row["beyond_5"] <= 0.05
+    # 1 %, or two pairs: at 2,048 points these are two of 121, views that overlap little.
+    assert row["beyond_45"] * row["called"] <= max(2.01, 0.01 * row["called"])
+
+
+@pytest.mark.parametrize("row", _HONEST["by_points"][3:], ids=lambda row: row["pairs_of"])
+def test_nearly_all_right_poses_of_solids_without_symmetry_are_called_converged(row):
+    assert row["right_solids_called"] >= 0.9
+
+
+def test_right_poses_of_scans_are_called_converged_and_wrong_ones_are_not():
+    scans, unsearched = (_kind(name) for name in ("real scans", "real scans, without search"))
+    assert scans["right_called"] >= 0.84 and scans["beyond_5"] == 0
+    assert unsearched["right"] < 0.7 and unsearched["beyond_5"] == 0
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "symmetric, noise", "few points against 64", "few points against 500"])
+def test_what_can_not_be_known_is_not_called_converged(kind):
+    assert _kind(kind)["called"] == 0
+
+
+def test_the_covariance_is_as_large_as_the_errors():
+    for row in _HONEST["covariance"]:
+        assert 0.5 < row["mean"] < 2.5, row
+
+
+def _kind(name: str) -> dict:
+    return next(row for row in _HONEST["by_kind"] if row["pairs_of"] == name)
 
 
 def test_regions_are_used_and_agree_between_both_clouds():

@@ -27,6 +27,10 @@ def as_dict(result: Registration) -> dict[str, Any]:
         "converged": bool(result.converged),
         "reason": result.reason,
         "information": _as_json(result.information),
+        "covariance": _as_json(result.covariance),
+        "alternatives": [
+            {"matrix": _as_json(matrix), "weight": weight} for matrix, weight in result.alternatives.likely()
+        ],
     }
 
 
@@ -51,10 +55,16 @@ def as_table(result: Registration) -> str:
         f"fitness      {float(result.fitness):<8.4f} share of the source within {reach} of the target",
         f"rmse         {float(result.rmse):<8.4g} of those points",
         "overlap      {:.0%} of the source, {:.0%} of the target".format(*np.asarray(result.overlap).tolist()),
+        f"deviation    {_deviation(result):<8} of the rotation, as the residuals show it",
         f"confidence   {float(result.confidence):.3f}",
         "converged    yes" if result.converged else f"converged    NO       {result.reason}",
     ]
     return "\n".join(lines)
+
+
+def _deviation(result: Registration) -> str:
+    degrees = np.rad2deg(np.sqrt(np.trace(np.asarray(result.covariance)[3:, 3:])))
+    return f"{degrees:.2g}°" if degrees < 180 else "unknown"
 
 
 def print_skipped(skipped: Sequence[tuple[str, str]]) -> None:

@@ -20,7 +20,8 @@ class Register:
         source: File of the cloud that moves.
         target: File of the cloud that stays.
         json: Print one JSON object: matrix, rotation, translation, fitness, rmse, overlap, confidence, converged,
-            reason, information. A number that is not finite is null.
+            reason, information, covariance, alternatives (matrix and weight of each). A number that is not finite is
+            null.
         out: Write the moved source here, as .ply (coloured by region), .xyz or .npy.
         picture: Write a picture of before and after here (.png, .pdf or .svg).
         search: Look among all poses, whatever the rotation and with partial overlap: 'auto' where the network's

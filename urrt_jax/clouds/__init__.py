@@ -4,7 +4,7 @@ from urrt_jax.clouds.checks import check_cloud
 from urrt_jax.clouds.cloud import Cloud, centroid, first, make_cloud, mean_square_radius, pad_clouds, shift, take
 from urrt_jax.clouds.curve import curve_order
 from urrt_jax.clouds.normals import normals
-from urrt_jax.clouds.sampling import farthest_points, subsample, thin
+from urrt_jax.clouds.sampling import farthest_points, subsample, thin, thinned_rows
 
 __all__ = [
     "Cloud",
@@ -21,4 +21,5 @@ __all__ = [
     "subsample",
     "take",
     "thin",
+    "thinned_rows",
 ]

@@ -62,14 +62,17 @@ def thin(cloud: Cloud, count: int, *, ordered: bool = False) -> Cloud:
       ordered: whether the points already lie along the curve, padding last, as those of a prepared cloud do; if not,
         they are sorted.
     """
-    size = cloud.points.shape[0]
-    if size <= count:
+    if cloud.points.shape[0] <= count:
         return cloud
-    real = jnp.sum(cloud.mask)
+    rows = thinned_rows(jnp.sum(cloud.mask), count)
+    return take(cloud, rows if ordered else curve_order(cloud.points, cloud.mask)[rows])
+
+
+def thinned_rows(real: Array, count: int) -> Array:
+    """The rows (count,) that ``thin`` keeps of a cloud along the curve with ``real`` () points, padding last."""
     # Integer strides while there are more real points than places; otherwise all of them, then padding. The remainder's
     # share is a quotient of floats, because slots · rest overflows; whole strides keep the places distinct.
     slots = jnp.arange(count)
     whole, rest = real // count, real % count
     strided = slots * whole + jnp.minimum(jnp.floor(slots * (rest / count)).astype(slots.dtype), rest)
-    rows = jnp.where(real > count, strided, slots)
-    return take(cloud, rows if ordered else curve_order(cloud.points, cloud.mask)[rows])
+    return jnp.where(real > count, strided, slots)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax import rigid
-from urrt_jax.assessment import agreement, fit_samples
+from urrt_jax.assessment import agreement, confidence_of_samples, find_alternatives, fit_samples
 from urrt_jax.clouds import Cloud, first, normals, subsample
 from urrt_jax.features import fpfh
 from urrt_jax.model.network import Model, propose
@@ -64,7 +64,8 @@ def search_quickly(search: Search, source: Samples, target: Samples, plain: Foun
     width = coarser(source, target)
     guesses = _from_features((source, target), few, width, search, _QUICK_MATCHES)
     found, unanimous = _choose([guesses], few, width, plain.transform, search, _QUICK_TRIED)
-    confidence = fit_samples(*few, found.transform, width).confidence
+    score = fit_samples(*few, found.transform, width).score
+    confidence = confidence_of_samples(score, find_alternatives(source, target, found.transform))
     settled = (confidence >= search.sure) | (unanimous & (confidence >= _UNANIMOUSLY * search.sure))
     return found._replace(pending=~settled)
 
