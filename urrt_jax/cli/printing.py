@@ -64,7 +64,7 @@ def as_table(result: Registration) -> str:
 
 def _deviation(result: Registration) -> str:
     degrees = np.rad2deg(np.sqrt(np.trace(np.asarray(result.covariance)[3:, 3:])))
-    return f"{degrees:.2g}°" if degrees < 180 else "unknown"
+    return f"{degrees:.2g}°" if degrees < 90 else "unknown"
 
 
 def print_skipped(skipped: Sequence[tuple[str, str]]) -> None:
