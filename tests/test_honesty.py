@@ -138,20 +138,25 @@ def test_the_covariance_is_about_the_targets_origin_and_in_its_unit(uneven):
     np.testing.assert_allclose(away, expected, rtol=0.05, atol=0.01 * expected.max())
 
 
-def test_traced_and_plain_calls_say_the_same(uneven):
-    source, target = _halves(uneven[1])
-    plain = register(source, target)
-    traced = jax.jit(lambda a, b: register(a, b, search=None))(source, target)
+def test_traced_and_plain_calls_say_the_same():
+    """Also of float64 clouds away from the origin, which a traced call brings near it first."""
+    shapes = symmetric_shapes(18, points=2 * _POINTS, seed=4)
+    source, target = (each.astype(np.float64) for each in _halves(shapes.points[2]))
+    source, target = source - 30, target + 20
+    plain = register(source, target, search=None)
+    traced = jax.jit(lambda reach: register(source, target, search=None, inlier_distance=reach))(0.1)
     assert float(traced.confidence) == pytest.approx(float(plain.confidence), abs=0.02)
-    np.testing.assert_allclose(traced.covariance, plain.covariance, rtol=0.05, atol=1e-7)
+    scale = np.abs(plain.covariance).max()
+    np.testing.assert_allclose(traced.covariance, plain.covariance, rtol=0.05, atol=1e-3 * scale)
     np.testing.assert_allclose(traced.alternatives.weight, plain.alternatives.weight, atol=0.05)
-    np.testing.assert_allclose(traced.alternatives.rotation, plain.alternatives.rotation, atol=0.05)
+    np.testing.assert_allclose(traced.alternatives.rotation, plain.alternatives.rotation, atol=0.02)
+    np.testing.assert_allclose(traced.alternatives.translation, plain.alternatives.translation, atol=0.02 * 60)
 
 
 _FAR = np.array([4e6, -2e6, 1e6])  # map coordinates
 
 
-@pytest.mark.parametrize("way", ["arrays", "pairs", "traced", "initial"])
+@pytest.mark.parametrize("way", ["arrays", "pairs", "initial"])
 def test_an_alternative_carries_the_source_onto_the_target(way):
     """Whatever the frame of either cloud, and however they are registered."""
     shapes = symmetric_shapes(18, points=2 * _POINTS, seed=4)
@@ -159,17 +164,12 @@ def test_an_alternative_carries_the_source_onto_the_target(way):
     source, target = source - _FAR, target + _FAR
     if way == "pairs":
         others = register_pairs([source], [target])[0].alternatives
-    elif way == "traced":
-        others = jax.jit(lambda turn: register(source, target, search=None, inlier_distance=turn))(0.1).alternatives
     else:
         initial = np.eye(4)
         initial[:3, :3] = _TURN.as_matrix()
         initial[:3, 3] = _FAR + _TURN.apply(_FAR)
         others = register(source, target, initial=initial if way == "initial" else None).alternatives
     assert others.weight[0] > 0.1
-    if way == "traced":  # float32 holds half a unit here
-        assert np.abs(others.matrix[0, :3, 3] - (_FAR + others.rotation[0] @ _FAR)).max() < 2
-        return
     moved = source @ others.matrix[0, :3, :3].T + others.matrix[0, :3, 3]
     distances = np.linalg.norm(moved[:, None] - target[None], axis=-1).min(axis=1)
     spacing = np.sort(np.linalg.norm(target[:, None] - target[None], axis=-1), axis=1)[:, 1].mean()

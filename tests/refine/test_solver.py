@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from urrt_jax import rigid
-from urrt_jax.assessment import cross_matrix
+from urrt_jax.assessment.precision import cross_matrix
 from urrt_jax.refine.pairs import Pairs
 from urrt_jax.refine.solver import bounded_step, damped_solve, move, normal_equations
 from urrt_jax.rigid import Rigid
