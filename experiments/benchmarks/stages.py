@@ -92,7 +92,7 @@ def measure(data: str) -> dict:
     found = approach.batched(*looked).found
     settled = settle.batched(refine, *ready, found.transform, found.width)
     last = expect.batched(refine, *ready, settled)
-    others = compare.batched(None, *samples, last.transform)
+    alternatives = compare.batched(None, *samples, last.transform)
 
     def took(program: Program, *inputs: Any) -> float:
         return 1e3 * median_seconds(lambda: jax.block_until_ready(program.batched(*inputs)), 7) / BATCH
@@ -113,7 +113,7 @@ def measure(data: str) -> dict:
         "refine on whole clouds": took(settle, refine, *ready, found.transform, found.width),
         "EM-ICP, for the pairs that need it": took(expect, refine, *ready, settled),
         "compare with other poses": took(compare, None, *samples, last.transform),
-        "assess": took(assess, True, *ready, last.transform, last.converged, others, told),
+        "assess": took(assess, True, *ready, last.transform, last.converged, alternatives, told),
         "regions of both clouds": took(label, model, ready[0], start.seen, start.source)
         + took(label, model, ready[1], start.still, start.target),
         "register": 1e3 * median_seconds(whole, 7) / BATCH,
