@@ -167,18 +167,22 @@ class Registration:
 
 def _in_words(result: Registration) -> str:
     """The reason of one pair."""
-    from scipy.spatial.transform import Rotation
-
     outcome = Outcome(int(result.outcome))
     reason = _REASONS[outcome]
     if outcome == Outcome.AMBIGUOUS:
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_matrix(np.asarray(result.alternatives.rotation[0]) @ np.asarray(result.rotation).T)
         angle = turn.magnitude()
         axis = ", ".join(f"{value:.2f}" for value in turn.as_rotvec() / max(angle, 1e-9))
         return f"{reason}: turned by {np.rad2deg(angle):.0f}° about the direction ({axis})"
     if outcome == Outcome.UNDETERMINED:
-        deviation = np.rad2deg(np.sqrt(np.trace(np.asarray(result.covariance)[3:, 3:])))
-        return (
-            f"{reason}: the standard deviation of its rotation is {deviation:.1f}°" if 2 < deviation < 180 else reason
-        )
+        deviation = rotation_deviation(result.covariance)
+        known = 2 < deviation < 180
+        return f"{reason}: the standard deviation of its rotation is {deviation:.1f}°" if known else reason
     return reason
+
+
+def rotation_deviation(covariance: ArrayLike) -> float:
+    """The standard deviation of the rotation, in degrees, of a pose with this covariance (6, 6)."""
+    return float(np.rad2deg(np.sqrt(np.trace(np.asarray(covariance)[3:, 3:]))))

@@ -154,9 +154,8 @@ def quick_rotation(moment: Array) -> Array:
     trace, symmetric = jnp.trace(moment), moment + moment.T
     turn = jnp.stack([moment[2, 1] - moment[1, 2], moment[0, 2] - moment[2, 0], moment[1, 0] - moment[0, 1]])
     power = jnp.block([[trace, turn], [turn[:, None], symmetric - trace * jnp.eye(3, dtype=moment.dtype)]])
-    power = power + 2 * jnp.eye(
-        4, dtype=moment.dtype
-    )  # eigenvalues are within √3 of zero: the first becomes the largest in size
+    # Eigenvalues are within √3 of zero: the first becomes the largest in size.
+    power = power + 2 * jnp.eye(4, dtype=moment.dtype)
 
     def square(_: int, power: Array) -> Array:
         power = jnp.sum(power[:, :, None] * power[None], axis=1)

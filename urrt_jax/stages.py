@@ -243,6 +243,7 @@ def assess(
     }
     outcome = jnp.select(list(outcomes.values()), [jnp.int32(each) for each in outcomes])
     against = jnp.where(usable, odds(others), 0.0)
+    unknown = jnp.diag(jnp.array(_UNKNOWN, precise.covariance.dtype))
     return Report(
         fitness=fitness,
         rmse=rmse,
@@ -253,11 +254,7 @@ def assess(
         outcome=outcome,
         correspondences=jnp.zeros_like(rows).at[source.rows].set(rows),
         information=information(nearest, inlier),
-        covariance=jnp.where(
-            usable & (precise.pairs > _FEWEST),
-            precise.covariance,
-            jnp.diag(jnp.array(_UNKNOWN, precise.covariance.dtype)),
-        ),
+        covariance=jnp.where(usable & (precise.pairs > _FEWEST), precise.covariance, unknown),
         alternatives=OtherPoses(*others.poses, against / (1 + jnp.sum(against))),
     )
 

@@ -18,9 +18,8 @@ _RINGS = (1.0, 1.5, 3.0)  # spacings of the coarser cloud: close, touching (samp
 _, _TOUCHING, _ABOUT = range(3)
 _BEYOND = 1.001  # neighbours are looked for a little farther than the farthest distance that counts
 _AT_ONCE = 16  # poses that are compared at once
-_WEIGHTS = (
-    np.array([3.0, 4.0, 4.2], np.float32) / 11.2
-)  # of overlap, tightness, closeness: a logistic regression on training shapes
+# Of overlap, tightness and closeness: a logistic regression on training shapes.
+_WEIGHTS = np.array([3.0, 4.0, 4.2], np.float32) / 11.2
 
 
 class Fit(NamedTuple):
@@ -146,24 +145,28 @@ def agreement(poses: Rigid, clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...],
     # Whole chunks only: what is left over would be compiled a second time.
     filled = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -count % few, axis=0)]), poses)
     chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, few, *leaf.shape[1:]), filled)
-    sides = jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
     masks = jnp.stack([each.mask for each in asked])
 
     def compare(some: Rigid) -> Array:
-        moved = jax.vmap(rigid.apply, (0, None))(some, asked[0].points)
-        back = jax.vmap(rigid.apply, (0, None))(jax.vmap(rigid.inverse)(some), asked[1].points)
-        placed = jnp.stack([moved, back]).reshape(2, -1, 3)
-
-        def look(side: Array) -> Array:
-            other = jax.tree.map(lambda leaf: leaf[1 - side], sides)
-            return nearest(placed[side], other).squared
-
-        squared = jax.lax.map(look, jnp.arange(2)).reshape(2, few, -1)
+        squared = squared_distances(some, clouds, asked)
         close = jnp.where(jnp.isfinite(squared), jnp.maximum(1 - squared / reach**2, 0.0), 0.0)
         totals = jnp.sum(jnp.where(masks[:, None], close, 0.0), axis=2)
         return jnp.mean(totals / jnp.maximum(jnp.sum(masks, axis=1), 1)[:, None], axis=0)
 
     return jax.lax.map(compare, chunks).reshape(-1)[:count]
+
+
+def squared_distances(poses: Rigid, clouds: tuple[Cloud, ...], asked: tuple[Cloud, ...]) -> Array:
+    """The squared distance from every query to the other cloud in each of H poses, (2, H, Q); inf where that is empty.
+
+    Arguments as for ``agreement``.
+    """
+    forth = jax.vmap(rigid.apply, (0, None))(poses, asked[0].points)
+    back = jax.vmap(rigid.apply, (0, None))(jax.vmap(rigid.inverse)(poses), asked[1].points)
+    others = jax.tree.map(lambda *leaves: jnp.stack(leaves), clouds[1], clouds[0])
+    # A loop over the two directions: the search is compiled once.
+    sides = jnp.stack([forth, back]).reshape(2, -1, 3), others
+    return jax.lax.map(lambda side: nearest(*side).squared, sides).reshape(2, *forth.shape[:2])
 
 
 def inlier_share(mask: Array, squared: Array, reach: Array) -> tuple[Array, Array]:

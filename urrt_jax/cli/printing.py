@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from urrt_jax.evaluation.metrics import rotation_degrees
-from urrt_jax.result import Registration
+from urrt_jax.result import Registration, rotation_deviation
 
 
 def as_dict(result: Registration) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def as_table(result: Registration) -> str:
 
 
 def _deviation(result: Registration) -> str:
-    degrees = np.rad2deg(np.sqrt(np.trace(np.asarray(result.covariance)[3:, 3:])))
+    degrees = rotation_deviation(result.covariance)
     return f"{degrees:.2g}°" if degrees < 90 else "unknown"
 
 
