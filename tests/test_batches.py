@@ -145,6 +145,15 @@ def test_a_bad_pair_is_reported_and_stops_no_other(call, pairs, found, number, s
     np.testing.assert_allclose(result.matrix[others], found.matrix[others], atol=1e-4)
 
 
+def test_a_cloud_in_another_unit_is_asked_about_and_the_others_are_not(call, pairs, found):
+    sources, targets = (list(each) for each in pairs)
+    sources[1] = 1000 * sources[1]
+    reasons = call(sources, targets).reasons
+    assert re.search(r"; the source is far larger than the target, scale ratio [\d.]+: is one in millimetres\?$", reasons[1])
+    others = [0, *range(2, len(SIZES))]
+    assert [reasons[each] for each in others] == [found.reasons[each] for each in others]
+
+
 def test_lists_of_bad_pairs_alone_are_reported(call):
     result = call([np.zeros((0, 3))], [np.zeros((5, 3))])
     assert "empty" in result.reasons[0] and not result.converged[0]

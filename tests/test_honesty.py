@@ -53,6 +53,14 @@ def test_a_handful_of_points_is_not_called_converged(uneven, count):
     assert not found.converged[wrong].any()
 
 
+@pytest.mark.parametrize("factor", [1000.0, 39.37, 1 / 39.37, 1 / 1000])
+def test_confidence_is_low_where_one_cloud_is_a_speck_beside_the_other(uneven, factor):
+    """As where one is in millimetres: it lies on the other in any rotation."""
+    pairs = [_halves(points) for points in uneven]
+    found = register_pairs([np.float32(factor) * source for source, _ in pairs], [target for _, target in pairs])
+    assert found.confidence.max() < 0.3
+
+
 _KINDS = ["cylinder", "prism_3", "prism_5", "prism_6", "propeller_2", "propeller_3", "propeller_5", "cube", "cone"]
 
 

@@ -306,6 +306,21 @@ def test_extreme_scale_scales_the_answer(call, cloud, target, plain, scale):
     assert bool(result.converged)
 
 
+@pytest.mark.parametrize(
+    ("factor", "says"), [(1000, "millimetres"), (0.01, "centimetres"), (39.37, "inches"), (6.5, "another unit")]
+)
+def test_a_pair_that_differs_in_size_is_asked_about_its_units(call, cloud, target, factor, says):
+    with pytest.warns(UserWarning, match=rf"scale ratio [\d.]+: is one in {says}\?"):
+        result = call(cloud * np.float32(factor), target)
+    assert not bool(result.converged)
+
+
+def test_stray_points_are_no_question_of_units(call, cloud, target):
+    stray = cloud.copy()
+    stray[:3] *= np.float32(1000)
+    call(stray, target)  # a warning would be an error here
+
+
 @pytest.mark.parametrize("scale", [1e16, 1e30])
 @pytest.mark.parametrize("which", ["source", "target"])
 def test_clouds_that_spread_too_far_for_float32_are_refused(call, cloud, target, which, scale):

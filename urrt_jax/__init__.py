@@ -8,6 +8,21 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from urrt_jax import (
+        clouds,
+        data,
+        evaluation,
+        io,
+        losses,
+        model,
+        neighbors,
+        peers,
+        refine,
+        rigid,
+        search,
+        training,
+        viewer,
+    )
     from urrt_jax.batches import Registrations, register_pairs
     from urrt_jax.clouds import pad_clouds
     from urrt_jax.model import Model, ModelConfig
@@ -16,7 +31,7 @@ if TYPE_CHECKING:
     from urrt_jax.registration import register
     from urrt_jax.result import OtherPoses, Outcome, Registration
     from urrt_jax.search import Search
-    from urrt_jax.warm_up import warm_up
+    from urrt_jax.warming import warm_up
     from urrt_jax.weights import available_models, load_model, model_card, save_model
 
 __version__ = "0.1.0"
@@ -31,18 +46,31 @@ __all__ = [
     "Registrations",
     "Search",
     "available_models",
+    "clouds",
+    "data",
+    "evaluation",
+    "io",
     "load_model",
+    "losses",
+    "model",
     "model_card",
+    "neighbors",
     "pad_clouds",
+    "peers",
+    "refine",
     "register",
     "register_pairs",
+    "rigid",
     "save_model",
+    "search",
+    "training",
     "use_compilation_cache",
+    "viewer",
     "warm_up",
 ]
 
-# Where the public names live. They are imported at their first use (PEP 562), so that the command line answers --help
-# without waiting for JAX.
+# Where the public names live; what is not here is a module. All are imported at their first use (PEP 562), so that the
+# command line answers --help without waiting for JAX.
 _HOMES = {
     "ICP": "urrt_jax.refine",
     "Model": "urrt_jax.model",
@@ -60,17 +88,19 @@ _HOMES = {
     "register_pairs": "urrt_jax.batches",
     "save_model": "urrt_jax.weights",
     "use_compilation_cache": "urrt_jax.program_cache",
-    "warm_up": "urrt_jax.warm_up",
+    "warm_up": "urrt_jax.warming",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _HOMES:
+        return importlib.import_module(f"{__name__}.{name}")
     value = getattr(importlib.import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted(globals().keys() | _HOMES.keys())
+    return sorted({*globals(), *__all__})

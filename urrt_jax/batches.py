@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from urrt_jax.assessment.alternatives import KEPT
 from urrt_jax.checks import check_whole
-from urrt_jax.clouds import check_cloud
+from urrt_jax.clouds import CloudLike, as_array, check_cloud
 from urrt_jax.host import PairOnHost
 from urrt_jax.model.network import Model
 from urrt_jax.refine import ICP
@@ -39,7 +39,8 @@ class Registrations(Sequence[Registration]):
     Attributes:
       results: each array has a leading axis B. ``correspondences`` and the regions are padded to the longest cloud with
         -1 and 0.
-      reasons: for each pair, "converged", or in words why it has not. A pair that can't be registered has the outcome
+      reasons: for each pair, "converged", or in words why it has not; with a question about units where one cloud is
+        more than five times as large as the other. A pair that can't be registered has the outcome
         ``Outcome.REFUSED`` and the message of the ``ValueError`` that ``register`` raises for it.
       sizes: (B, 2) int, how many points the source and the target of each pair have.
     """
@@ -106,8 +107,8 @@ class Registrations(Sequence[Registration]):
 
 
 def register_pairs(
-    sources: Sequence[ArrayLike],
-    targets: Sequence[ArrayLike],
+    sources: Sequence[CloudLike],
+    targets: Sequence[CloudLike],
     *,
     model: Model | None = None,
     refine: ICP | None = ICP(),
@@ -125,7 +126,7 @@ def register_pairs(
     reason in words.
 
     Args:
-      sources: B clouds (N_i, 3), arrays or lists, as for ``register``.
+      sources: B clouds (N_i, 3), as for ``register``.
       targets: B clouds (M_i, 3).
       model: as for ``register``.
       refine: as for ``register``.
@@ -139,6 +140,20 @@ def register_pairs(
     Returns:
       A sequence of B ``Registration``s, and their arrays with a leading axis: ``found[0].rotation`` is (3, 3), and
       ``found.rotation`` (B, 3, 3).
+
+    Example:
+      >>> import numpy as np
+      >>> import urrt_jax
+      >>> from urrt_jax.data import demo_shape
+      >>> source = demo_shape(200)
+      >>> found = urrt_jax.register_pairs([source, source[:2]], [source + 5.0, source])
+      >>> found
+      Registrations(2 pairs, 1 of them converged)
+      >>> found.translation.round(2) + 0.0
+      array([[5., 5., 5.],
+             [0., 0., 0.]])
+      >>> found.reasons
+      ['converged', 'source: a pose needs at least 3 distinct points, got 2 among 2']
 
     Raises:
       ValueError: the lists are empty or of different lengths, or an option is wrong.
@@ -168,6 +183,8 @@ def register_pairs(
             )
             for index, result in zip(pairs, each, strict=True):
                 found[index] = result
+                if not result.converged and (hint := pairs[index].units_hint()):
+                    reasons[index] = f"{result.reason}; {hint}"
                 bar.update()
 
         for index, given in enumerate(zip(sources, targets, starts, strict=True)):
@@ -202,6 +219,7 @@ class _Asked:
 
 
 def _check_pair(source: Any, target: Any, initial: Any, inlier_distance: float | None) -> PairOnHost:
+    source, target = as_array(source, "source"), as_array(target, "target")
     check_cloud(source, None, "source")
     check_cloud(target, None, "target")
     if initial is not None:
@@ -252,8 +270,8 @@ def _refused(source: int, target: int) -> Registration:
 def _length(cloud: Any) -> int:
     """How many points a cloud has that need not be one."""
     try:
-        return len(cloud)
-    except TypeError:
+        return len(as_array(cloud, "cloud"))
+    except (ValueError, TypeError):
         return 0
 
 

@@ -18,6 +18,10 @@ from urrt_jax.result import OtherPoses, Registration
 from urrt_jax.rigid import Rigid
 from urrt_jax.stages import Outputs, Told
 
+_ALIKE = 5.0  # a guess: parts of one object that overlap by a fifth seldom differ more in size
+_UNITS = {"centimetres": 100.0, "millimetres": 1000.0, "inches": 39.37}  # how many of them make a metre
+_NEAR = 0.3  # of the logarithm: two scans of one object differ by up to a third in size
+
 
 class PairOnHost:
     """One pair as NumPy arrays, in its frame, and the way back to the arrays that were given.
@@ -76,6 +80,16 @@ class PairOnHost:
             mask: Any = np.arange(size) < len(points)
             clouds.append(Cloud(padded, mask))
         return clouds[0], clouds[1], self.told
+
+    def units_hint(self) -> str | None:
+        """A question about units where one cloud is more than five times as large as the other, else None."""
+        source, target = map(_radius, self._points)
+        larger, smaller = ("source", "target") if source > target else ("target", "source")
+        ratio = max(source, target) / max(min(source, target), 1e-30)
+        if ratio <= _ALIKE:
+            return None
+        unit = next((name for name, size in _UNITS.items() if abs(np.log(ratio / size)) < _NEAR), "another unit")
+        return f"the {larger} is far larger than the {smaller}, scale ratio {ratio:.4g}: is one in {unit}?"
 
     def restore(self, outputs: Outputs) -> Registration:
         """The result, as NumPy arrays, in the user's frame and rows; float64 where it depends on an origin."""
@@ -144,6 +158,11 @@ def abstract_pair(size: int, dtype: DTypeLike = np.float32, batch: int | None = 
 
     cloud = Cloud(array((size, 3), dtype), array((size,), bool))
     return cloud, cloud, Told(array((), bool), array((3,), dtype), array((), bool), array((), dtype), array((), dtype))
+
+
+def _radius(points: np.ndarray) -> float:
+    """The median distance of the points from their median: stray points do not change it."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def is_exact(points: Any) -> bool:

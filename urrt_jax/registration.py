@@ -1,6 +1,7 @@
 """The one call: from two clouds to the transform that aligns them, with honest diagnostics."""
 
 import dataclasses
+import warnings
 from typing import Any, Literal
 
 import jax
@@ -12,7 +13,7 @@ from jax.typing import ArrayLike
 
 from urrt_jax import rigid
 from urrt_jax.assessment import moved_covariance, moved_information
-from urrt_jax.clouds import Cloud, check_cloud, first, make_cloud
+from urrt_jax.clouds import Cloud, CloudLike, as_array, check_cloud, first, make_cloud
 from urrt_jax.frames import Frame, normalize_pair
 from urrt_jax.host import PairOnHost, abstract_pair, is_exact
 from urrt_jax.model.network import Model
@@ -30,8 +31,8 @@ _UNEVEN = 1e-3  # what the entries of R Rᵀ may be off the identity's
 
 
 def register(
-    source: ArrayLike,
-    target: ArrayLike,
+    source: CloudLike,
+    target: CloudLike,
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
@@ -58,7 +59,8 @@ def register(
 
     Args:
       source: (N, 3) real numbers, any unit. NumPy arrays of float64 or integers are centred before they become float32,
-        and the translation of the result is then NumPy float64: a far origin (map coordinates) costs no digits.
+        and the translation of the result is then NumPy float64: a far origin (map coordinates) costs no digits. A cloud
+        of Open3D, trimesh or pyvista is taken by its points, a mesh by its vertices.
       target: (M, 3), the same unit.
       source_mask: (N,) bool, False for padding; None when every point is real.
       target_mask: (M,) bool.
@@ -85,7 +87,27 @@ def register(
         positive; an initial transform that is not rigid. Under jit values can't be seen: points that are not finite or
         lie beyond ±1e15 are then ignored, and a cloud left without three points, or an initial transform that is not
         finite, is flagged by ``converged`` and ``outcome``.
+
+    Example:
+      >>> import numpy as np
+      >>> import urrt_jax
+      >>> from urrt_jax.data import demo_shape
+      >>> source = demo_shape(200).astype(np.float64)
+      >>> turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+      >>> result = urrt_jax.register(source, source @ turn.T + [0.0, 0.0, 5.0])
+      >>> bool(result.converged), result.reason
+      (True, 'converged')
+      >>> np.asarray(result.matrix).round(3) + 0.0
+      array([[ 0.8, -0.6,  0. ,  0. ],
+             [ 0.6,  0.8,  0. ,  0. ],
+             [ 0. ,  0. ,  1. ,  5. ],
+             [ 0. ,  0. ,  0. ,  1. ]])
+
+    Warns:
+      UserWarning: it has not converged, and one cloud is more than five times as large as the other, as where one is in
+        millimetres and the other in metres. Not under jit.
     """
+    source, target = as_array(source, "source"), as_array(target, "target")
     check_cloud(source, source_mask, "source")
     check_cloud(target, target_mask, "target")
     check_options(model, refine, search, inlier_distance)
@@ -129,6 +151,8 @@ def _register_arrays(
     """``register`` of arrays: padding is stripped, the frame is made in float64, and stages run on a rung."""
     pair = PairOnHost(source, target, source_mask, target_mask, initial, inlier_distance)
     result = register_on_host(options, pair)
+    if not result.converged and (hint := pair.units_hint()):
+        warnings.warn(hint, UserWarning, stacklevel=3)
     cast = jax.tree.map(lambda leaf: leaf.astype(pair.dtype) if leaf.dtype == np.float64 else leaf, result)
     device = jax.device_put(cast)  # jnp.asarray compiles a small program for each new shape
     if any(is_exact(points) for points in (source, target)):

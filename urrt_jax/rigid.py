@@ -50,7 +50,17 @@ def compose(outer: Rigid, inner: Rigid) -> Rigid:
 
 
 def inverse(transform: Rigid) -> Rigid:
-    """The transform that undoes this one."""
+    """The transform that undoes this one.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> quarter = Rigid(jnp.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), jnp.array([1.0, 0.0, 0.0]))
+      >>> points = jnp.array([[1.0, 2.0, 3.0]])
+      >>> apply(quarter, points).tolist()
+      [[-1.0, 1.0, 3.0]]
+      >>> apply(inverse(quarter), apply(quarter, points)).tolist()
+      [[1.0, 2.0, 3.0]]
+    """
     back = transform.rotation.T
     return Rigid(back, -rotate(back, transform.translation))
 

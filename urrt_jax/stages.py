@@ -35,7 +35,7 @@ from urrt_jax.assessment import (
     precision,
     well_posed,
 )
-from urrt_jax.clouds import Cloud, first
+from urrt_jax.clouds import Cloud, first, mean_square_radius
 from urrt_jax.loops import where_needed
 from urrt_jax.model.encoding import Encoding
 from urrt_jax.model.network import Model, point_regions
@@ -227,9 +227,13 @@ def assess(
     measured = measure(found, others, precise)
     checks = confidence(measured)
     usable = determined & told.initial_is_finite & jnp.all(jnp.isfinite(measured))
+    spacing = prepared.coarser(source, target)
+    # A cloud that is smaller than the other's spacing is a point to it, and fits in any rotation.
+    smaller = jnp.minimum(*(mean_square_radius(each.cloud) for each in (source, target)))
+    checks = checks._replace(determined=jnp.where(smaller > spacing**2, checks.determined, 0.0))
     total = jnp.where(usable, checks.total, 0.0)
     sure, least = total >= 0.5, jnp.argmin(jnp.stack(checks))
-    lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * prepared.coarser(source, target)
+    lost = jnp.where(sure & settled, _LOST_GRID, _COARSE_GRID) * spacing
     # In order of precedence; the first that holds is the outcome.
     outcomes = {
         Outcome.INITIAL: ~jnp.asarray(told.initial_is_finite),

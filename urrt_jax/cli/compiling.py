@@ -5,7 +5,7 @@ from typing import Any
 
 from urrt_jax.registration import make_options
 from urrt_jax.stages import rung
-from urrt_jax.warm_up import is_warm, warm_up
+from urrt_jax.warming import is_warm, warm_up
 
 
 def compile_for(size: int, *, model: Any, refine: Any, search: Any) -> None:

@@ -1,11 +1,32 @@
 """What is refused of a user's cloud, in words that name the argument."""
 
+from typing import Any, Protocol
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
+
+
+class _HasPoints(Protocol):
+    @property
+    def points(self) -> Any: ...
+
+
+class _HasVertices(Protocol):
+    @property
+    def vertices(self) -> Any: ...
+
+
+class _HasTensors(Protocol):
+    @property
+    def point(self) -> Any: ...
+
+
+CloudLike = ArrayLike | _HasPoints | _HasVertices | _HasTensors
+"""What users pass as a cloud: (N, 3) numbers, or another library's cloud (``as_array`` says which)."""
 
 
 def check_cloud(points: ArrayLike, mask: ArrayLike | None, name: str) -> None:
@@ -55,12 +76,33 @@ def check_cloud(points: ArrayLike, mask: ArrayLike | None, name: str) -> None:
         raise ValueError(f"{name}: a pose needs at least 3 distinct points, got {distinct} among {len(values)}")
 
 
-def as_array(points: ArrayLike, name: str) -> Array | np.ndarray:
-    """The argument itself if it is an array, traced or not; else what NumPy makes of it."""
+def as_array(points: CloudLike, name: str) -> Array | np.ndarray:
+    """The array itself, traced or not; the points of another library's cloud; else what NumPy makes of the argument.
+
+    A cloud of another library is known by its attributes, and nothing is imported: ``points`` (Open3D's point cloud,
+    pyvista's data sets, ``urrt_jax.io.PointCloud``), ``point.positions`` (Open3D's tensor cloud) or ``vertices``
+    (trimesh, and Open3D's meshes).
+
+    Args:
+      points: an array, nested lists, or such an object.
+      name: how the caller calls this argument.
+
+    Raises:
+      ValueError: rows of different lengths.
+    """
     if isinstance(points, jax.Array | np.ndarray):
         return points
+    held: Any = points
+    if hasattr(held, "point"):
+        held = held.point.positions.numpy()
+    elif hasattr(held, "points") and not hasattr(held, "mask"):  # the points of our Cloud are not all real
+        held = held.points
+    elif hasattr(held, "vertices"):
+        held = held.vertices
+    if isinstance(held, jax.Array):
+        return held
     try:
-        return np.asarray(points)
+        return np.asarray(held)
     except ValueError as error:
         raise ValueError(f"{name}: expected an (N, 3) array, got a ragged {type(points).__name__}") from error
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from urrt_jax.clouds.checks import as_array
+from urrt_jax.clouds.checks import CloudLike, as_array
 
 FARTHEST = 1e15
 """Larger coordinates are refused, or masked out under jit: their squares would not be float32 numbers."""
@@ -48,14 +48,20 @@ def make_cloud(points: ArrayLike, mask: ArrayLike | None = None) -> Cloud:
     return Cloud(jnp.where(mask[:, None], points, 0.0), mask)
 
 
-def pad_clouds(clouds: Sequence[ArrayLike], *, size: int | None = None) -> tuple[Array, Array]:
+def pad_clouds(clouds: Sequence[CloudLike], *, size: int | None = None) -> tuple[Array, Array]:
     """One array for clouds of different sizes: points (B, size, 3) float32 and mask (B, size).
 
     Clouds at map coordinates lose digits here; subtract an origin from each first.
 
     Args:
-      clouds: B arrays (N_i, 3).
+      clouds: B clouds (N_i, 3), as for ``register``.
       size: the padded length; the longest cloud's when None.
+
+    Example:
+      >>> import numpy as np
+      >>> points, mask = pad_clouds([np.ones((2, 3)), np.ones((5, 3))])
+      >>> points.shape, mask.sum(axis=1).tolist()
+      ((2, 5, 3), [2, 5])
 
     Raises:
       ValueError: no clouds, a cloud that is not (N, 3), or one longer than ``size``.

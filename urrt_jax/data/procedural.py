@@ -95,7 +95,12 @@ def procedural_shapes(count: int = 256, *, points: int = 1024, seed: int = 0, qu
 
 
 def demo_shape(points: int = 2048, *, seed: int = 9) -> np.ndarray:
-    """One object to show, without symmetry: (points, 3) float32 in the unit sphere."""
+    """One object to show, without symmetry: (points, 3) float32 in the unit sphere.
+
+    Example:
+        >>> demo_shape(500).shape
+        (500, 3)
+    """
     parts = _asymmetric_parts("mixed", np.random.default_rng([seed, 0, 0]))
     return unit_sphere(_outer_surface(parts, points, np.random.default_rng([seed, 0, 1])))[0].astype(np.float32)
 

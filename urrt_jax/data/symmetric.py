@@ -44,6 +44,13 @@ def symmetric_shapes(count: int = len(_KINDS), *, points: int = 1024, seed: int 
     only near the origin, and its farthest point may lie a little inside the unit sphere. Where parts of a propeller
     overlap, at the hub, points are drawn on the covered surface as well.
 
+    Example:
+        >>> shapes = symmetric_shapes(3, points=100)
+        >>> shapes.points.shape, shapes.names
+        ((3, 100, 3), ('prism_3_0000', 'prism_4_0001', 'prism_5_0002'))
+        >>> len(symmetry("prism_4"))
+        8
+
     Args:
         count: how many shapes.
         points: points in each.

@@ -35,6 +35,13 @@ def chamfer(
         for pairs that overlap only in part.
       block: see ``nearest``.
 
+    Example:
+      >>> import jax.numpy as jnp
+      >>> from urrt_jax.clouds import make_cloud
+      >>> corners = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+      >>> float(chamfer(make_cloud(corners), make_cloud(corners + jnp.array([0.0, 0.0, 2.0]))))
+      4.0
+
     Raises:
       ValueError: an unknown penalty, a scale that is not positive, or a trim outside [0, 1).
     """

@@ -18,6 +18,13 @@ class Search:
 
     A pytree: whole numbers fix shapes and are static; the other numbers are leaves, whose values compile nothing anew.
 
+    Example:
+      >>> Search(max_angle=90.0, preference=0.2).kept
+      4
+      >>> Search(max_angle=-1.0)
+      Traceback (most recent call last):
+      ValueError: max_angle: expected a positive number, got -1.0
+
     Attributes:
       points: points of each cloud's subsample in the thorough search.
       normal_radius: of the neighbourhood of a normal.
