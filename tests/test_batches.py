@@ -149,7 +149,9 @@ def test_a_cloud_in_another_unit_is_asked_about_and_the_others_are_not(call, pai
     sources, targets = (list(each) for each in pairs)
     sources[1] = 1000 * sources[1]
     reasons = call(sources, targets).reasons
-    assert re.search(r"; the source is far larger than the target, scale ratio [\d.]+: is one in millimetres\?$", reasons[1])
+    assert re.search(
+        r"; the source is far larger than the target, scale ratio [\d.]+: is one in millimetres\?$", reasons[1]
+    )
     others = [0, *range(2, len(SIZES))]
     assert [reasons[each] for each in others] == [found.reasons[each] for each in others]
 
