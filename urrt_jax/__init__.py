@@ -1,7 +1,17 @@
 """Rigid registration of 3D point clouds in JAX.
 
 ``register(source, target)`` finds the rotation and translation with ``target ≈ R @ source + t``: an unsupervised
-region-aware transformer (3D-URRT, Hao and Fang) followed by exact refinement, as one pure function.
+region-aware transformer (3D-URRT, Hao and Fang) followed by exact refinement, as one pure function. ``stages`` tells
+how, step by step, and ``model`` what the network does.
+
+- One pair and many: ``registration`` (``register``), ``batches`` (``register_pairs``), ``result`` (``Registration``).
+- The way of a pair: ``frames`` (its frame), ``prepared`` (a cloud prepared for all stages), ``stages``, and then
+  ``model`` (the network), ``search`` (hypotheses), ``refine`` (ICP and EM-ICP), ``assessment`` (confidence).
+- Geometry: ``clouds`` (points and mask, samples, normals), ``neighbors``, ``features``, ``rigid`` (rigid transforms).
+- Compilation: ``programs`` (compiled once a shape), ``program_cache`` (kept on disk), ``warming``, ``loops``.
+- Training: ``training``, ``losses``, ``data`` (shapes), ``weights`` (the packaged models).
+- Measuring: ``evaluation`` (protocols, metrics, ``evaluate``), ``peers`` (other libraries' methods).
+- Files, pictures, commands: ``io``, ``viewer``, ``cli``.
 """
 
 import importlib

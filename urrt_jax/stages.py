@@ -1,15 +1,34 @@
-"""The stages of a registration, each compiled by itself, and the ladder of sizes that they are compiled for.
+"""The stages of a registration, compiled one by one, and the ladder of sizes that they are compiled for.
 
-``register_in_frame`` is the whole way from two clouds to a result: a Python function that calls one program after
-another. On arrays it reads from each result whether a rare stage is needed, and runs (and compiles) it only then. Under
-a trace the same stages are composed, and rare ones become loops that only run for pairs which need them.
+A registration takes these steps. Each one after the first is a *stage*: a program of its own (``programs``).
+
+1. **Normalise** (``frames``, before the stages). Both clouds are centred, and divided by one common scale, their root
+   mean square radius. The result is carried back into the clouds' own units at the end.
+2. **Prepare** (``prepare``). Each cloud is sorted along a space-filling curve; its spacing and normals are measured.
+   Farthest-point sampling chooses 512 points, the same ones however the cloud is turned, moved, scaled or ordered.
+   Clouds of more than 4,096 points are first thinned along the curve, and that does depend on how they are turned.
+3. **Estimate** (``estimate``). The network (``urrt_jax.model``) estimates the transform from these samples. The user's
+   initial transform takes its place where it fits better.
+4. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. It calls for a search
+   where the samples do not fit in it.
+5. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``; rare). Matched FPFH features and the
+   network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Nothing is random.
+6. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
+   directions, among the full clouds, mostly point to plane. The bandwidth of its weights shrinks to the spacing, and
+   then to the spread of the distances themselves, so that points without a counterpart do not pull. Small clouds whose
+   points have no counterparts at all are refined by EM-ICP (``expect``; rare).
+7. **Compare** (``compare``). Other poses that fit about as well: the source is turned about the centre of both clouds,
+   and the turns that fit best are refined and compared with the pose.
+8. **Assess** (``assess``). Inliers, overlap, the information matrix, the covariance, and the confidence.
+9. **Label** (``label``). The region of every point.
+
+``register_in_frame`` calls the stages. On arrays it reads from each result whether a rare stage is needed, and runs
+(and compiles) it only then. Under a trace the same stages are composed, and rare ones become loops that only run for
+pairs which need them.
 
 Network, search, the coarse stage of refinement and ``compare`` see samples of fixed size: they are compiled once,
 whatever the clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole clouds and are compiled for each rung
 of the ladder, as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
-
-The *plain pose* is what registration has before any search: the network's estimate, or the user's initial transform
-where that fits better, after the coarse stage of refinement.
 """
 
 from typing import Any, Literal, NamedTuple

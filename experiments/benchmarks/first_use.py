@@ -336,7 +336,7 @@ def save(folder: Path, cases: dict, command: str) -> None:
 def as_markdown(cases: dict) -> str:
     """The table, then the machines and versions that it was measured with."""
     columns = ("empty", "filled", "open3d")
-    lines = ["| seconds | empty cache | asked | filled cache | asked | Open3D |", "|---|---:|---:|---:|---:|---:|"]
+    lines = ["| seconds | empty cache | goal | filled cache | goal | Open3D |", "|---|---:|---:|---:|---:|---:|"]
     for case in cases.values():
         values = {column: _table_rows(case, case[column]) for column in columns if column in case}
         for row in values["empty"]:

@@ -157,9 +157,10 @@ def as_markdown(results: dict) -> str:
     share = 100 * hot["gflops"] / hot["gflops_of_a_large_product"]
     lines += [
         "",
-        f"Placing landmarks: {hot['gflops']:.0f} GFLOP/s, {share:.0f} % of what one large product of matrices reaches "
-        f"({hot['gflops_of_a_large_product']:.0f}); were no logit kept in a cache, it would move "
-        f"{hot['gb_per_second']:.0f} GB/s, where a copy moves {hot['gb_per_second_of_a_copy']:.0f}.",
+        f"The hot loop, which places landmarks, computes {hot['gflops']:.0f} GFLOP/s. That is {share:.0f} % of the "
+        f"{hot['gflops_of_a_large_product']:.0f} GFLOP/s that one large matrix product reaches on this machine. If no "
+        f"logit stayed in a cache, the loop would move {hot['gb_per_second']:.0f} GB/s; a copy moves "
+        f"{hot['gb_per_second_of_a_copy']:.0f} GB/s.",
     ]
     return "\n".join(lines) + "\n"
 

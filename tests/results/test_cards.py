@@ -8,7 +8,7 @@ import pytest
 from experiments.summary import load
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+PAGE = (ROOT / "experiments" / "README.md").read_text()
 CARDS = {path.stem: json.loads(path.read_text()) for path in sorted((ROOT / "urrt_jax" / "weights").glob("*.json"))}
 
 
@@ -28,9 +28,9 @@ def test_measurements_of_the_card_are_those_of_the_tables(name):
 
 
 @pytest.mark.parametrize("name", CARDS)
-def test_readme_shows_the_training_command_and_its_time(name):
-    assert CARDS[name]["command"] in README.replace(" \\\n    ", " ")
-    assert f"{name}`: {CARDS[name]['seconds'] / 60:.0f} minutes" in README
+def test_page_of_results_shows_the_training_command_and_its_time(name):
+    assert CARDS[name]["command"] in PAGE.replace(" \\\n    ", " ")
+    assert f"{name}`: {CARDS[name]['seconds'] / 60:.0f} minutes" in PAGE
 
 
 @pytest.mark.parametrize("name", CARDS)

@@ -1,4 +1,4 @@
-"""The committed results, the tables drawn from them and the README agree with each other.
+"""The committed results and the tables drawn from them agree with each other.
 
 The tests of this folder only read files: `pytest tests/results` takes seconds. All but `test_settings.py` need neither
 JAX nor `urrt_jax`; `pytest -n 0 --noconftest --ignore tests/results/test_settings.py tests/results` runs them without.
@@ -16,7 +16,6 @@ from experiments.summary import load
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENTS, WEIGHTS = ROOT / "experiments", ROOT / "urrt_jax" / "weights"
-README = (ROOT / "README.md").read_text()
 TABLES = ("table1_ablation", "table2_noise", "table3_comparison", "beyond", "unseen", "default_call")
 OTHERS = ("figure4_qualitative", "confidence", "regions")
 FILES = (*(f"{name}/results.json" for name in (*TABLES, *OTHERS)), "benchmarks/speed.json")
@@ -56,32 +55,6 @@ def test_tables_are_drawn_from_their_results(name):
     assert (EXPERIMENTS / name / "table.md").read_text() == as_markdown(load(name))
 
 
-def test_the_summary_is_drawn_from_the_results():
-    assert (EXPERIMENTS / "summary.md").read_text() == summary.as_markdown() + "\n"
-
-
-BENCHMARKS = ["benchmarks/speed.md", "benchmarks/stages.md", "benchmarks/neighbors.md"]
-
-
-@pytest.mark.parametrize("name", [*BENCHMARKS, "summary.md", "trials/table.md", "ablation/table.md"])
-def test_readme_shows_the_tables_that_were_written(name):
-    for table in (EXPERIMENTS / name).read_text().strip().split("\n\n"):
-        assert table in README
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_readme_shows_the_command_of_every_table(name):
-    """With the flags that the results record. Results from before `urrt reproduce` was renamed keep the old name."""
-    flags = load(name)["command"].partition(" --data ")[2]
-    assert f"`python -m experiments.reproduce {name.split('_')[0]} --data {flags}`" in README
-
-
-def test_readme_states_how_often_regions_agree():
-    numbers = load("regions")["numbers"]
-    shares = [f"{100 * numbers[f'consistency {when}']:.0f} %" for when in ("in the last step", "before alignment")]
-    assert "{} have the same region once the clouds are nearly aligned, {}\n  before".format(*shares) in README
-
-
-def test_readme_states_the_errors_of_crops_searched_about_the_middle_of_the_poses():
-    near = next(row for row in summary.find_part(load("beyond"), "rpmnet")["rows"] if row["method"] == "search_near")
-    assert f"the mean is {near['angle_mean']:.2f}°, {near['asymmetric']['angle_mean']:.2f}° without" in README
+@pytest.mark.parametrize("name", summary.TABLES)
+def test_summaries_are_drawn_from_the_results(name):
+    assert (EXPERIMENTS / f"summary_{name}.md").read_text() == "\n".join(summary.TABLES[name]()) + "\n"

@@ -1,4 +1,7 @@
-"""Region attention: every region looks at every other, with its centroid as its position."""
+"""Region attention: every region attends to every other, with its centroid as its position.
+
+Eq. (2) of the paper sums α(f_i), which the softmax weights, adding to 1, would leave as it is. Here it sums α(f_j).
+"""
 
 import flax.linen as nn
 import jax

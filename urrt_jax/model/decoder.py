@@ -1,8 +1,9 @@
 """Region-aware decoding: from the encodings of both clouds to one transform.
 
-Decoder g_k reads what region k knows of both clouds and gives its share of the answer; the shares are fused by how many
-points the region holds. What a share is, is the configuration's: landmarks (``landmarks.py``), aligned where they agree
-(``consensus.py``), or a pose (``pose.py``).
+Decoder g_k reads the features of region k in both clouds and gives that region's share of the transform; the shares are
+weighted by how many points the region holds. The paper does not say what a share is, and a weighted sum of rotation
+matrices is no rotation. Here shares are landmarks (``landmarks``), aligned where they agree (``consensus``), or the
+nine numbers of a pose (``pose``), as the configuration says.
 """
 
 import jax

@@ -1,4 +1,8 @@
-"""Point encoder: an embedding for every point and, by max-pooling, one for the shape."""
+"""Point encoder: an embedding for every point and, by max-pooling, one for the shape.
+
+The paper does not name its encoder. This is PointNet's (Qi et al. 2017), which reads a point's coordinates and the
+invariants of its surroundings. It has layer normalisation: batch normalisation has a state and mixes pairs.
+"""
 
 import flax.linen as nn
 import jax.numpy as jnp

@@ -1,6 +1,8 @@
 """Region partition: n branches say to which region a point belongs and whether it lies inside the shape.
 
-One set of branches serves source and target, so that region k means the same part in both.
+One set of branches serves source and target, so that region k means the same part in both. The softmax of the branches
+gives the region. The paper also takes the occupancy from that softmax, which cannot say "outside"; here it is the
+largest logit (``occupancy_logits``).
 """
 
 from typing import NamedTuple
