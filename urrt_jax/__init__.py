@@ -19,9 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from urrt_jax import (
+        assessment,
         clouds,
         data,
         evaluation,
+        features,
         io,
         losses,
         model,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
         refine,
         rigid,
         search,
+        stages,
         training,
         viewer,
     )
@@ -55,10 +58,12 @@ __all__ = [
     "Registration",
     "Registrations",
     "Search",
+    "assessment",
     "available_models",
     "clouds",
     "data",
     "evaluation",
+    "features",
     "io",
     "load_model",
     "losses",
@@ -73,6 +78,7 @@ __all__ = [
     "rigid",
     "save_model",
     "search",
+    "stages",
     "training",
     "use_compilation_cache",
     "viewer",
