@@ -1,5 +1,6 @@
 """Writing a file whole or not at all."""
 
+import contextlib
 import os
 import secrets
 from pathlib import Path
@@ -8,16 +9,21 @@ from pathlib import Path
 def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> None:
     """Writes the file, so that a reader, or a kill at any moment, finds the old content or all of the new.
 
+    Where `path` is a symbolic link, the file it points to is written and the link stays.
+
     Raises:
       OSError: the folder does not exist or can't be written; the message names ``path``.
     """
-    path = Path(path)
-    # In the same folder, because a move is atomic only within one file system; machines may share it.
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
+    target = Path(os.path.realpath(path))
+    # In the same folder, because a move is atomic only within one file system; machines may share it. The name is not
+    # made from the target's, which may be as long as a name can be.
+    unfinished = target.with_name(f".{os.getpid()}-{secrets.token_hex(8)}.part")
     try:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(unfinished, path)
+        os.replace(unfinished, target)
     except OSError as error:
-        raise type(error)(error.errno, error.strerror, str(path)) from error
+        raise type(error)(error.errno, error.strerror or str(error), str(path)) from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        # Whatever keeps it from being removed also kept it from being written, and has been raised already.
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
