@@ -75,6 +75,20 @@ def _default_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "urrt_jax" / "programs"
 
 
+def cached_files() -> tuple[Path, dict[Path, int]]:
+    """The user's cache folder, and the files in it with their sizes in bytes: programs, and what training has compiled.
+
+    Raises:
+      RuntimeError: there is no home folder.
+    """
+    root = _default_folder().parent
+    sizes = {}
+    for path in [*root.glob(f"programs/*{_SUFFIX}*"), *root.glob("jax/*/*")]:
+        with contextlib.suppress(OSError):  # another process has just removed it
+            sizes[path] = path.stat().st_size
+    return root, sizes
+
+
 @functools.cache
 def processor() -> str:
     """A name for this kind of processor: a home folder may be shared by several, and programs are compiled for one."""

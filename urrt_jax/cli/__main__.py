@@ -2,6 +2,6 @@
 
 import sys
 
-from urrt_jax.cli import main
+from urrt_jax.cli import console
 
-sys.exit(main())
+sys.exit(console())

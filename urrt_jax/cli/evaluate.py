@@ -16,6 +16,12 @@ class Evaluate:
     continues a run that was stopped (remove the folder after changing code). An item on which a method fails is scored
     as the identity and listed.
 
+    Two methods on made-up shapes: urrt evaluate --methods register icp --limit 100 --out results.json
+
+    A harder protocol: urrt evaluate --protocol 'outliers share=0.2' --methods register
+
+    Exit codes: 0, the figures were written. 2, wrong use or bad input.
+
     Attributes:
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, else
             'procedural'. For the protocol 'scans' a .npz with names, pose_to_world and pts_<name>.
@@ -52,6 +58,7 @@ class Evaluate:
         from urrt_jax import __version__, model_card
         from urrt_jax.atomic import write_atomically
         from urrt_jax.cli.printing import changed_flags, print_skipped, without_folder
+        from urrt_jax.cli.streams import note, show
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.evaluation import evaluate, find_method, find_protocol, load_scan_pairs, spread, values_path
 
@@ -76,10 +83,7 @@ class Evaluate:
         self.out.parent.mkdir(parents=True, exist_ok=True)
         figures, failures = {}, {}
         if sys.stderr.isatty() and any(method.batch > 1 for method in methods.values()):
-            print(
-                "urrt: our methods compile at their first batch, unless an earlier run kept the programs",
-                file=sys.stderr,
-            )
+            note("our methods compile at their first batch, unless an earlier run kept the programs")
         for name, method in methods.items():
             save = values_path(self.out.parent / "items", name, method, self.protocol, pairs, items)
             save.parent.mkdir(exist_ok=True)
@@ -102,11 +106,11 @@ class Evaluate:
             "seed": "the number of each item",
             "methods": identities,
         }
-        print(figures_table(figures))
+        show(figures_table(figures))
         write_atomically(
             self.out, json.dumps(settings | {"figures": figures, "failed_items": failures}, indent=2) + "\n"
         )
-        print(f"wrote {self.out}, and the values of every item to {self.out.parent / 'items'}")
+        note(f"wrote {self.out}, and the values of every item to {self.out.parent / 'items'}")
         return 0
 
 

@@ -3,12 +3,14 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from urrt_jax.atomic import write_atomically
 from urrt_jax.evaluation.metrics import rotation_degrees
 from urrt_jax.result import Registration, rotation_deviation
 
@@ -65,6 +67,15 @@ def as_table(result: Registration) -> str:
 def _deviation(result: Registration) -> str:
     degrees = rotation_deviation(result.covariance)
     return f"{degrees:.2g}°" if degrees < 90 else "unknown"
+
+
+def write_picture(path: Path, source: np.ndarray, target: np.ndarray, result: Registration) -> None:
+    """Writes the picture of before and after, whole or not at all; the extension chooses the format."""
+    from urrt_jax.viewer import plot_registration
+
+    content = BytesIO()
+    plot_registration(source, target, result).savefig(content, format=path.suffix[1:].lower())
+    write_atomically(path, content.getvalue())
 
 
 def print_skipped(skipped: Sequence[tuple[str, str]]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import sys
 import time
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -92,7 +91,13 @@ class Train:
     """Train a network on shapes, without labels. The same command continues a run that was stopped.
 
     The folder gets config.json, metrics.jsonl, checkpoints/ and at the end model.npz with its card model.json:
-    'urrt register A B --model DIR/model.npz' uses it.
+    'urrt register A B --model DIR/model.npz' uses it. Ctrl-C saves first.
+
+    A trial run on made-up shapes: urrt train --out runs/trial --steps 100 --every 50
+
+    On ModelNet40: urrt train --out runs/modelnet40 --data ModelNet40/
+
+    Exit codes: 0, the model was written. 2, wrong use or bad input. 130, stopped by Ctrl-C.
 
     Attributes:
         out: Folder of the run.
@@ -166,7 +171,9 @@ class Train:
         import jax
 
         from urrt_jax import __version__, save_model
+        from urrt_jax.cli.interrupt import leave_ctrl_c_to_python
         from urrt_jax.cli.printing import print_skipped
+        from urrt_jax.cli.streams import note
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.training.loop import LoopConfig, train
 
@@ -181,15 +188,16 @@ class Train:
         if self.categories is not None:
             loaded = loaded.first_categories(self.categories)
         shapes, validation = loaded.split_validation(self.validation_share, self.seed)
-        print(f"{len(shapes)} shapes to train on, {len(validation)} held out")
+        note(f"{len(shapes)} shapes to train on, {len(validation)} held out")
         print_skipped(loaded.skipped)
         occupancy = "a shell around each cloud" if loaded.queries is None else "inside and outside of closed meshes"
-        print(f"the regions learn from {occupancy}")
+        note(f"the regions learn from {occupancy}")
         resumed, start = (self.out / "config.json").exists(), time.perf_counter()
+        leave_ctrl_c_to_python()  # the loop saves first
         try:
             model = train(config, shapes, validation, self.out, loop=loop)
         except KeyboardInterrupt:
-            print(f"urrt: stopped; the same command continues the run in {self.out}", file=sys.stderr)
+            note(f"stopped; the same command continues the run in {self.out}")
             return 130
         path = save_model(
             model,
@@ -210,7 +218,7 @@ class Train:
                 "log": validations(self.out / "metrics.jsonl"),
             },
         )
-        print(f"wrote {path}")
+        note(f"wrote {path}")
         return 0
 
     def command(self) -> str:

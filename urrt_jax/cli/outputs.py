@@ -1,0 +1,63 @@
+"""Files that a command is told to write: what is wrong with their names is said before any work."""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+PICTURES = (".png", ".pdf", ".svg")
+
+
+def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path | None] = ()) -> None:
+    """Nothing, if each of these files could be written and no other file of the command would be overwritten.
+
+    Args:
+      outputs: by the name of the flag, for instance "--out"; None where a flag is not given.
+      inputs: files that the command reads; None where there is none.
+
+    Raises:
+      ValueError: a folder is missing or can't be written to, a name is that of a folder, or two names are one file.
+    """
+    taken = {_identity(path): f"{path} is read" for path in inputs if path is not None}
+    for flag, path in outputs.items():
+        if path is None:
+            continue
+        if not path.parent.is_dir():
+            raise ValueError(f"{flag}: {path}: there is no folder {path.parent} to write to")
+        if path.is_dir():
+            raise ValueError(f"{flag}: {path} is a folder, a file was expected")
+        if not os.access(path.parent, os.W_OK):
+            raise ValueError(f"{flag}: {path}: the folder {path.parent} can't be written to")
+        if (use := taken.get(_identity(path))) is not None:
+            raise ValueError(f"{flag}: {use} by this command too; choose another name")
+        taken[_identity(path)] = f"{path} is written by {flag}"
+
+
+def check_picture(path: Path | None, flag: str) -> None:
+    """Nothing, if a picture can be drawn into a file of this name, or none is asked for.
+
+    Raises:
+      ValueError: another extension than .png, .pdf or .svg.
+      ImportError: Matplotlib is not installed.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() not in PICTURES:
+        raise ValueError(f"{flag}: {path}: a picture can be written as {', '.join(PICTURES)}")
+    if not has_matplotlib():
+        raise ImportError(f"{flag}: pictures need Matplotlib: pip install 'urrt-jax[viz]'")
+
+
+def has_matplotlib() -> bool:
+    """Whether Matplotlib is installed."""
+    from importlib.util import find_spec
+
+    return find_spec("matplotlib") is not None
+
+
+def _identity(path: Path) -> object:
+    """What is equal for two names of one file: hard links and names on a file system that ignores case, too."""
+    try:
+        status = path.stat()
+    except OSError:
+        return path.resolve()
+    return status.st_dev, status.st_ino
