@@ -151,6 +151,36 @@ def test_a_command_that_was_told_to_ignore_ctrl_c_ignores_it():
         process.kill()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="os.kill does not send Ctrl-C there")
+def test_training_gets_ctrl_c_back_as_an_exception():
+    program = """
+import os, signal
+from urrt_jax.cli.interrupt import end_on_ctrl_c, leave_ctrl_c_to_python
+end_on_ctrl_c()
+leave_ctrl_c_to_python()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    signal.pause()
+except KeyboardInterrupt:
+    print("saved")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout) == (0, "saved\n"), done.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="it has no signal masks")
+def test_a_child_process_gets_ctrl_c_as_usual():
+    child = "import signal; print(signal.getsignal(2) is signal.default_int_handler, signal.pthread_sigmask(0, []))"
+    program = f"""
+import subprocess, sys
+from urrt_jax.cli.interrupt import end_on_ctrl_c
+end_on_ctrl_c()
+subprocess.run([sys.executable, "-c", {child!r}], check=True)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
+    assert done.stdout == "True set()\n", done.stderr
+
+
 def test_a_warning_is_one_line_on_stderr(capsys, monkeypatch):
     def run(self):
         warnings.warn("scale ratio 1000:\nis one in millimetres?", stacklevel=1)

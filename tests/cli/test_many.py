@@ -155,7 +155,7 @@ def test_the_summary_counts_what_did_not_converge_by_reason(files, scans, calls,
     lines = "".join(f"scans/{name},far.ply\n" for name in ("a.ply", "b.xyz"))
     assert run(files, "--pairs", table("source,target\nscans/a.ply,model.ply\n" + lines)) == 1
     err = capsys.readouterr().err
-    assert "of 3 pairs 1 converged, 2 did not, and 0 could not be read or registered" in err
+    assert "3 pairs: 1 converged, 2 did not, 0 could not be read or registered" in err
     assert "2 did not converge: another pose fits about as well\n" in err
 
 
@@ -181,7 +181,7 @@ class TestAnotherRun:
         before = Path("results.csv").read_bytes()
         assert folder_run(files) == 0
         assert len(calls) == 1 and Path("results.csv").read_bytes() == before
-        assert "results.csv holds 3 of 3 pairs" in capsys.readouterr().err
+        assert "already in results.csv, not run again: 3 pairs of 3\n" in capsys.readouterr().err
 
     def test_goes_on_where_the_first_was_stopped(self, files, scans, calls, monkeypatch):
         monkeypatch.setattr(many, "_BATCH", 1)
@@ -207,7 +207,8 @@ class TestAnotherRun:
         assert folder_run(files) == 0
         changed = 3 if name == "model.ply" else 1
         assert len(calls[1]["sources"]) == changed
-        assert f"{changed} pairs in results.csv have changed files" in capsys.readouterr().err
+        said = "3 pairs" if changed == 3 else "1 pair"
+        assert f"have changed since, run again: {said}\n" in capsys.readouterr().err
 
     def test_repeats_what_has_another_initial_transform(self, files, scans, calls):
         np.savetxt("start.txt", np.eye(4))
@@ -232,7 +233,7 @@ class TestAnotherRun:
         (scans / "scans/b.xyz").unlink()
         assert folder_run(files) == 0
         assert [row["source"] for row in rows()] == ["scans/a.ply", "scans/c.npy", "scans/b.xyz"]
-        assert "1 pairs in results.csv are not asked for now" in capsys.readouterr().err
+        assert "not asked for now, kept below the others: 1 pair\n" in capsys.readouterr().err
 
     @pytest.mark.parametrize("content", [b"", b"a,b\n1,2\n", b"\xff\xfe", b"cut"], ids=repr)
     def test_does_not_overwrite_a_file_of_another_kind(self, files, scans, calls, capsys, content):

@@ -168,11 +168,11 @@ class Results:
                 self._rows[key] = row
             else:
                 changed += 1
-        note(f"{path} holds {len(self._rows)} of {len(self._keys)} pairs; they are not run again")
+        note(f"already in {path}, not run again: {_pairs(len(self._rows))} of {len(wanted)}")
         if changed:
-            note(f"{changed} pairs in {path} have changed files or initial transforms; they are run again")
+            note(f"files or initial transform have changed since, run again: {_pairs(changed)}")
         if self._others:
-            note(f"{len(self._others)} pairs in {path} are not asked for now; they are kept below the others")
+            note(f"in {path} but not asked for now, kept below the others: {_pairs(len(self._others))}")
 
     def add(self, pair: Pair, row: dict[str, str]) -> None:
         """Takes up the row of one pair."""
@@ -193,6 +193,10 @@ class Results:
     def rows(self) -> list[dict[str, str]]:
         """The rows of the pairs so far, in their order."""
         return [self._rows[self._keys[pair]] for pair in self.pairs if self._keys[pair] in self._rows]
+
+
+def _pairs(count: int) -> str:
+    return "1 pair" if count == 1 else f"{count} pairs"
 
 
 def _digest(pair: Pair) -> str:
@@ -370,8 +374,8 @@ def print_summary(found: Mapping[str, Any]) -> None:
         note(f"failed: {each['source']} to {each['target']}: {each['reason']}")
     unsure, failed = sum(found["not_converged"].values()), len(found["failed"])
     note(
-        f"of {found['pairs']} pairs {found['converged']} converged, {unsure} did not, "
-        f"and {failed} could not be read or registered"
+        f"{_pairs(found['pairs'])}: {found['converged']} converged, {unsure} did not, "
+        f"{failed} could not be read or registered"
     )
     for reason, count in found["not_converged"].items():
         note(f"  {count} did not converge: {reason}")
