@@ -412,7 +412,14 @@ print(json.dumps([events, type(result).__name__, np.asarray(result.singular).tol
 
     def test_the_default_folder_is_in_the_users_cache(self, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        monkeypatch.delenv("URRT_NO_CACHE", raising=False)
         assert use_compilation_cache() == tmp_path / "urrt_jax" / "programs"
+
+    def test_the_environment_can_forbid_the_default_folder(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        monkeypatch.setenv("URRT_NO_CACHE", "1")
+        assert use_compilation_cache() is None
+        assert not (tmp_path / "urrt_jax").exists()
 
     def test_a_negative_size_is_refused(self, tmp_path):
         with pytest.raises(ValueError, match="-1"):

@@ -45,6 +45,8 @@ _Device = Any  # jax.Device, which pyright doesn't take for a type
 def use_compilation_cache(folder: str | os.PathLike[str] | None = None, *, max_bytes: int = 2**29) -> Path | None:
     """The folder that keeps compiled programs from now on in this process, or None if it can't be made or read.
 
+    None also where the environment variable ``URRT_NO_CACHE`` is set and no folder is named.
+
     Entries are unpickled, and unpickling can run any code: the folder must belong to the user, and nobody else may
     write to it. A new folder gets mode 0700. A folder that can only be read is used, but nothing is added to it.
 
@@ -58,6 +60,8 @@ def use_compilation_cache(folder: str | os.PathLike[str] | None = None, *, max_b
     global _cache
     if max_bytes < 0:
         raise ValueError(f"max_bytes must not be negative, got {max_bytes}")
+    if folder is None and os.environ.get("URRT_NO_CACHE"):
+        return None
     try:
         folder = Path(folder) if folder is not None else _default_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
