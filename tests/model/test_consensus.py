@@ -178,6 +178,18 @@ def test_derivatives_at_coinciding_landmarks_are_finite():
     assert np.all(np.isfinite(slopes))
 
 
+def test_derivatives_are_finite_where_nothing_speaks_for_any_hypothesis():
+    """The landmarks of an empty cloud lie in one place: weights of hypotheses are then as good as zero, not zero."""
+
+    def total(source, target, weights):
+        seeds = even_seeds([20], 8)
+        found = align_landmarks(source, target, weights, rounds=3, seeds=seeds)
+        return jnp.sum(found.rotation * jnp.arange(9.0).reshape(3, 3)) + jnp.sum(found.translation)
+
+    slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(jnp.zeros((20, 3)), _landmarks(), _weights())
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)
+
+
 def test_seeds_are_spread_evenly_and_as_many_of_swapped_groups():
     seeds = even_seeds([64, 256, 256], 64)
     groups = np.searchsorted([64, 320], seeds, side="right")

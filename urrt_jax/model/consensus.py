@@ -108,7 +108,9 @@ def _misfits(landmarks: _Landmarks, weights: Array, turn: Callable[[Array], Arra
     themselves are made coordinate by coordinate: as products they would lose digits.
     """
     sums = jnp.matmul(weights, landmarks.products, precision=_HIGHEST)
-    sums = sums[1:] / jnp.where(sums[0] > 0, sums[0], 1.0)
+    # Weights that sum to less are nothing: the derivative of a quotient divides by the square of their sum.
+    enough = sums[0] > _NOTHING
+    sums = jnp.where(enough, sums[1:] / jnp.where(enough, sums[0], 1.0), 0.0)
     here, there, lengths = sums[:3], sums[3:6], sums[15]
     moment = sums[6:15].reshape(3, 3) - there[:, None] * here
     rotation = turn(moment + _STIFFNESS * jnp.eye(3, dtype=moment.dtype))
