@@ -193,11 +193,26 @@ def test_missing_file_is_named(saved, suffix):
         load_model(saved)
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '"text"', '{"config": {}}', '{"config": "x", "sha256": "0"}'])
-def test_card_that_is_none_is_refused(saved, content):
-    saved.with_suffix(".json").write_text(content)
-    with pytest.raises(ValueError, match=r"net\.json|configuration"):
-        load_model(saved)
+_DAMAGED_CARDS = {
+    "cut": "{",
+    "no object": "[]",
+    "text": '"text"',
+    "empty": "{}",
+    "no hash": '{"config": {}}',
+    "configuration that is text": '{"config": "x", "sha256": "0"}',
+    "hash that is no text": '{"config": {}, "sha256": 7}',
+    "hash that is nothing": '{"config": {}, "sha256": null}',
+    "a thousand deep": "[" * 100_000,
+    "no UTF-8": b"\xff\xfe{}",
+}
+
+
+@pytest.mark.parametrize("read", [load_model, model_card])
+@pytest.mark.parametrize("content", _DAMAGED_CARDS.values(), ids=_DAMAGED_CARDS)
+def test_card_that_is_none_is_refused(saved, content, read):
+    saved.with_suffix(".json").write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError, match=r"^model: .*net\.json is no model card: "):
+        read(saved)
 
 
 def test_unknown_name_lists_the_known_ones():
@@ -208,17 +223,28 @@ def test_unknown_name_lists_the_known_ones():
 def test_unknown_config_field_is_named(saved):
     config = model_card(saved)["config"]
     _edit_card(saved, config=config | {"colour": "blue"})
-    with pytest.raises(ValueError, match=r"unknown fields \['colour'\]"):
+    with pytest.raises(ValueError, match=r"net\.json: .*unknown fields \['colour'\]"):
         load_model(saved)
 
 
 @pytest.mark.parametrize(
-    "change", [{"regions": 0}, {"regions": "many"}, {"regions": 2.5}, {"variant": "Z"}, {"encoder_widths": 3}]
+    "change",
+    [
+        {"regions": 0},
+        {"regions": "many"},
+        {"regions": 2.5},
+        {"variant": "Z"},
+        {"variant": []},
+        {"encoder_widths": 3},
+        {"encoder_widths": [True]},
+        {"encoder_widths": [[1]]},
+    ],
+    ids=str,
 )
-def test_impossible_config_is_refused(saved, change):
+def test_impossible_config_is_refused_and_its_file_is_named(saved, change):
     config = model_card(saved)["config"]
     _edit_card(saved, config=config | change)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=r"^model: .*net\.json: "):
         load_model(saved)
 
 

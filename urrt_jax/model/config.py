@@ -64,7 +64,7 @@ class ModelConfig:
         for name in ("encoder_widths", "position_widths", "decoder_widths"):
             widths = getattr(self, name)
             object.__setattr__(self, name, tuple(widths))
-            if any(not isinstance(width, int) or width < 1 for width in widths):
+            if any(type(width) is not int or width < 1 for width in widths):
                 raise ValueError(f"{name}: expected positive integers, got {widths}")
 
     @property

@@ -57,14 +57,14 @@ def model_card(source: str | Path = DEFAULT) -> dict[str, Any]:
     """What is recorded about a model: its configuration, data, command, log summary and metrics.
 
     Raises:
-      ValueError: no such model.
+      ValueError: no such model, or a file that is no model card.
     """
     if isinstance(source, str) and source in available_models():
         return json.loads((resources.files("urrt_jax.weights") / f"{source}.json").read_text())
     path = _sibling(source, ".json")
     if not path.is_file():
         raise ValueError(f"model: {path} does not exist, and no packaged model has this name ({available_models()})")
-    return json.loads(path.read_text())
+    return _read_card(path)
 
 
 def save_model(model: Model, path: str | Path, card: dict[str, Any] | None = None) -> Path:
@@ -106,13 +106,9 @@ def _read(weights: Path, card_path: Path) -> tuple[Model, dict[str, Any]]:
     for path in (weights, card_path):
         if not path.is_file():
             raise ValueError(f"model: {path} does not exist; a model is a .npz and a .json of one name")
-    try:
-        card = json.loads(card_path.read_text())
-        config = ModelConfig.from_dict(card["config"])
-        expected_hash = card["sha256"]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"model: {card_path} is no model card ({error!r})") from error
-    content = weights.read_bytes()
+    card = _read_card(card_path)
+    config, expected_hash = _config(card, card_path), card["sha256"]
+    content = _read_bytes(weights)
     found_hash = hashlib.sha256(content).hexdigest()
     if found_hash != expected_hash:
         raise ValueError(
@@ -123,9 +119,43 @@ def _read(weights: Path, card_path: Path) -> tuple[Model, dict[str, Any]]:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             flat = {key: archive[key] for key in archive.files}
     except Exception as error:  # numpy and zipfile raise many kinds for a broken archive
-        raise ValueError(f"model: {weights} cannot be read ({error})") from error
+        raise ValueError(f"model: {weights} cannot be read ({type(error).__name__}: {error})") from error
     _check_parameters(flat, config, weights)
     return Model(config, unflatten_dict({tuple(key.split("/")): leaf for key, leaf in flat.items()})), card
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"model: {path} cannot be read ({error.strerror or error})") from error
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    """The card in this file, with a configuration that is an object and a hash that is one."""
+    try:
+        card = json.loads(_read_bytes(path).decode())
+    except RecursionError:
+        raise ValueError(f"model: {path} is no model card: it is nested too deeply") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"model: {path} is no model card: it is no JSON ({error})") from error
+    if not isinstance(card, dict):
+        raise ValueError(f"model: {path} is no model card: expected an object, got {type(card).__name__}")
+    for name, kind, what in (("config", dict, "an object"), ("sha256", str, "text")):
+        if not isinstance(card.get(name), kind):
+            found = f"got {card[name]!r:.80}" if name in card else "which is missing"
+            raise ValueError(f"model: {path} is no model card: expected {what} as {name!r}, {found}")
+    return card
+
+
+def _config(card: dict[str, Any], path: Path) -> ModelConfig:
+    """The configuration of a card."""
+    try:
+        return ModelConfig.from_dict(card["config"])
+    except ValueError as error:
+        raise ValueError(f"model: {path}: {error}") from error
+    except TypeError as error:  # a number in the place of a list
+        raise ValueError(f"model: {path}: its configuration holds a value of the wrong type ({error})") from error
 
 
 def _check_parameters(flat: dict[str, np.ndarray], config: ModelConfig, path: Path) -> None:
