@@ -3,11 +3,13 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,11 @@ from urrt_jax.training.checkpoints import Checkpoints
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig, TrainState, init_state
 
+# Where a load fails, Orbax leaves other reads unfinished: they end after its event loop, or are never awaited.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+    pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning"),
+]
 _CONFIG = TrainConfig(
     model=ModelConfig(
         regions=2, width=4, encoder_widths=(4,), branch_width=4, position_widths=(4,), decoder_widths=(4,)
@@ -124,6 +131,148 @@ def test_a_leftover_temporary_folder_does_not_count(tmp_path, state):
         assert int(checkpoints.restore_latest(state).step) == 1
 
 
+@pytest.fixture(scope="module")
+def two_saved(state, tmp_path_factory):
+    """The folder of a run with the checkpoints of steps 1 and 2, of which step 1 has the smaller loss."""
+    directory = tmp_path_factory.mktemp("run")
+    with Checkpoints(directory, _CONFIG) as checkpoints:
+        checkpoints.save(_at(state, 1), 0.1)
+        checkpoints.save(_at(state, 2), 0.2)
+    return directory
+
+
+@pytest.fixture
+def run(two_saved, tmp_path):
+    """A copy of ``two_saved``, to be damaged."""
+    return Path(shutil.copytree(two_saved, tmp_path / "run"))
+
+
+def _files(run, step: int, name: str) -> list:
+    found = [path for path in (run / "checkpoints" / str(step)).rglob(name) if path.is_file()]
+    assert found, f"Orbax names its files otherwise: no {name}"
+    return found
+
+
+def _flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def _cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+# "d" holds the values, in two files: Orbax reads the large one without any check.
+_DAMAGES = {
+    "flipped values": lambda run, step: [_flip(path) for path in _files(run, step, "d/*")],
+    "cut values": lambda run, step: [_cut(path) for path in _files(run, step, "d/*")],
+    "no values": lambda run, step: [path.unlink() for path in _files(run, step, "d/*")],
+    "flipped index": lambda run, step: [_flip(path) for path in _files(run, step, "manifest.ocdbt")],
+    "cut description": lambda run, step: [_cut(path) for path in _files(run, step, "_METADATA")],
+    "no state": lambda run, step: shutil.rmtree(run / "checkpoints" / str(step) / "state"),
+    "nothing": lambda run, step: [path.unlink() for path in _files(run, step, "*")],
+}
+
+
+@pytest.mark.parametrize("damage", _DAMAGES.values(), ids=_DAMAGES)
+def test_damaged_newest_checkpoint_gives_way_to_the_one_before(run, state, damage):
+    damage(run, 2)
+    with Checkpoints(run, _CONFIG) as checkpoints:
+        with pytest.warns(UserWarning, match="training goes on from step 1, because newer checkpoints are damaged"):
+            restored = checkpoints.restore_latest(state)
+        _assert_same(restored, _at(state, 1))
+
+
+@pytest.mark.parametrize("damage", ["flipped values", "no state"])
+def test_step_of_a_damaged_checkpoint_can_be_saved_again(run, state, damage):
+    _DAMAGES[damage](run, 2)
+    with Checkpoints(run, _CONFIG) as checkpoints:
+        with pytest.warns(UserWarning, match="damaged"):
+            checkpoints.restore_latest(state)
+        checkpoints.save(_at(state, 2), 0.2)
+    with Checkpoints(run, _CONFIG) as checkpoints:
+        _assert_same(checkpoints.restore_latest(state), _at(state, 2))
+
+
+def test_damaged_checkpoint_is_set_aside_not_deleted(run, state):
+    _DAMAGES["cut values"](run, 2)
+    with Checkpoints(run, _CONFIG) as checkpoints, pytest.warns(UserWarning, match="they are now in .*damaged"):
+        checkpoints.restore_latest(state)
+    assert (run / "damaged" / "2" / "state").is_dir()
+
+
+def test_where_no_checkpoint_is_whole_the_folder_is_named_and_nothing_moved(run, state):
+    for step in (1, 2):
+        _DAMAGES["cut values"](run, step)
+    with (
+        Checkpoints(run, _CONFIG) as checkpoints,
+        pytest.raises(ValueError, match="checkpoints: no checkpoint is whole"),
+    ):
+        checkpoints.restore_latest(state)
+    assert _folders(run) == {"1", "2"}
+
+
+def test_damaged_best_checkpoint_gives_way_to_the_next_best(run, state):
+    _DAMAGES["flipped values"](run, 1)
+    with Checkpoints(run, _CONFIG) as checkpoints, pytest.warns(UserWarning, match="that of step 2 is used instead"):
+        _assert_same(checkpoints.restore_best(state), _at(state, 2))
+
+
+def test_without_a_whole_checkpoint_there_is_no_best(run, state):
+    for step in (1, 2):
+        _DAMAGES["cut values"](run, step)
+    with Checkpoints(run, _CONFIG) as checkpoints, pytest.warns(UserWarning, match="no other is whole"):
+        assert checkpoints.restore_best(state) is None
+
+
+def test_values_that_are_readable_but_not_those_saved_are_damage(run, state, monkeypatch):
+    """Orbax's own checksums don't cover all that a disk may change."""
+    with Checkpoints(run, _CONFIG) as checkpoints:
+        load = checkpoints._checkpointer.load
+
+        def changed(step, like):
+            found = load(step, like)
+            return found | {"step": found["step"] + 1} if step == 2 else found
+
+        monkeypatch.setattr(checkpoints._checkpointer, "load", changed)
+        with pytest.warns(UserWarning, match="step 2: its checksum is another"):
+            _assert_same(checkpoints.restore_latest(state), _at(state, 1))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"null", b"\xff", b"[" * 100_000], ids=lambda each: repr(each[:9])
+)
+def test_damaged_configuration_is_named(run, content):
+    (run / "config.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"config\.json, which says how .* is damaged"):
+        Checkpoints(run, _CONFIG)
+
+
+def test_missing_configuration_of_saved_checkpoints_is_named(run):
+    """What they hold is then unknown, and a new configuration would be taken for theirs."""
+    (run / "config.json").unlink()
+    with pytest.raises(ValueError, match=r"config\.json, which says how .* is missing"):
+        Checkpoints(run, _CONFIG)
+
+
+def test_second_run_in_a_folder_is_refused_and_the_process_named(tmp_path):
+    with (
+        Checkpoints(tmp_path, _CONFIG),
+        pytest.raises(ValueError, match=f"{tmp_path}: process {os.getpid()} is training"),
+    ):
+        Checkpoints(tmp_path, _CONFIG)
+
+
+def test_folder_is_free_after_a_run_that_was_refused(tmp_path):
+    with Checkpoints(tmp_path, _CONFIG):
+        pass
+    with pytest.raises(ValueError, match="another configuration"):
+        Checkpoints(tmp_path, dataclasses.replace(_CONFIG, seed=1))
+    with Checkpoints(tmp_path, _CONFIG):
+        pass
+
+
 # Saves 16 MB states without end; every leaf of a state holds its step number.
 _SAVER = """
     import sys
@@ -151,6 +300,8 @@ def test_a_save_killed_in_the_middle_leaves_whole_checkpoints_only(tmp_path, wai
             line = saver.stdout.readline()
             assert line, "the saver ended by itself"
             begun = int(line)
+        with pytest.raises(ValueError, match=f"process {saver.pid} is training here"):
+            Checkpoints(tmp_path, TrainConfig())
         time.sleep(wait)
     finally:
         os.kill(saver.pid, signal.SIGKILL)

@@ -234,6 +234,35 @@ def test_log_drops_a_line_that_was_cut_short(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "line",
+    [
+        b"no JSON",
+        b"\xff\xfe",
+        b"7",
+        b"null",
+        b'["train", 1]',
+        b"{}",
+        b'{"kind": "train"}',
+        b'{"step": 1}',
+        b'{"kind": "train", "step": "1"}',
+        b'{"kind": "train", "step": null}',
+        b'{"kind": ["train"], "step": 1}',
+        b'{"kind": "validation", "step": 1}',
+        b'{"kind": "validation", "step": 1, "validation_loss": "low"}',
+        b"[" * 100_000,
+    ],
+    ids=lambda line: repr(line[:60]),
+)
+def test_log_drops_a_foreign_line_and_says_so(tmp_path, line):
+    path = tmp_path / "metrics.jsonl"
+    Log(path, 0).write("train", 1, {"loss": 1.0})
+    path.write_bytes(line + b"\n" + path.read_bytes())
+    with pytest.warns(UserWarning, match=r"metrics\.jsonl: 1 lines that are no entries .* the first is line 1$"):
+        Log(path, 5).write("train", 2, {"loss": 0.5})
+    assert [entry["step"] for entry in _lines(tmp_path)] == [1, 2]
+
+
+@pytest.mark.parametrize(
     ("losses", "patience", "stalled"),
     [
         pytest.param([], 2, False, id="nothing yet"),

@@ -5,6 +5,7 @@ import json
 import signal
 import threading
 import time
+import warnings
 import zlib
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -61,6 +62,7 @@ def train(
 
     The folder holds ``config.json``, ``metrics.jsonl`` (one object a line: ``kind`` "train" or "validation", ``step``
     and the metrics) and ``checkpoints/``. A resumed run is bit-equal to one that was never stopped. Ctrl-C saves first.
+    Where the newest checkpoint is damaged, the run continues from the last whole one, with a warning.
 
     Args:
       config: what is trained; must agree with the folder's.
@@ -70,8 +72,8 @@ def train(
       loop: how it is watched.
 
     Raises:
-      ValueError: the folder holds a run with another configuration or other data, or the intervals do not
-        fit ``steps_per_call``.
+      ValueError: the folder holds a run with another configuration or other data, another process is training there,
+        its configuration or all of its checkpoints are damaged, or the intervals do not fit ``steps_per_call``.
       FloatingPointError: a whole interval of steps had non-finite gradients.
       KeyboardInterrupt: on Ctrl-C, after the state was saved.
     """
@@ -203,22 +205,44 @@ def _arrays(shapes: Shapes) -> dict[str, jax.Array]:
     return arrays
 
 
+def _entry(line: str) -> dict[str, Any] | None:
+    """What a line of the log says, or None if it is no such line."""
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(entry, dict) or type(entry.get("step")) is not int or not isinstance(entry.get("kind"), str):
+        return None
+    if entry["kind"] == "validation" and type(entry.get("validation_loss")) not in (int, float):
+        return None
+    return entry
+
+
 class Log:
-    """The run's metrics as JSON lines; lines beyond ``step``, from a run that was killed later, are dropped."""
+    """The run's metrics as JSON lines; lines beyond ``step``, from a run that was killed later, are dropped.
+
+    Lines that are no entries, as a damaged file has, are dropped with a warning.
+    """
 
     def __init__(self, path: Path, step: int) -> None:
         self._path = path
         self._losses: list[float] = []
-        kept = []
-        if path.exists():
-            for line in path.read_text().splitlines():
-                try:
-                    entry = json.loads(line)
-                except json.JSONDecodeError:  # the kill hit the middle of a line
-                    continue
-                if entry["step"] <= step:
-                    kept.append(line)
-                    self._note(entry)
+        kept, foreign = [], []
+        lines = path.read_bytes().decode(errors="replace").split("\n") if path.exists() else []
+        for number, line in enumerate(lines, start=1):
+            entry = _entry(line)
+            # What follows the last line's end is nothing, or a line that a kill cut short.
+            if entry is None and number < len(lines):
+                foreign.append(number)
+            elif entry is not None and entry["step"] <= step:
+                kept.append(line)
+                self._note(entry)
+        if foreign:
+            warnings.warn(
+                f"{path}: {len(foreign)} lines that are no entries of this log were dropped, the first is line "
+                f"{foreign[0]}",
+                stacklevel=2,
+            )
         write_atomically(path, "".join(line + "\n" for line in kept))
 
     def write(self, kind: str, step: int, values: dict[str, float]) -> None:
