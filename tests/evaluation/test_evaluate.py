@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,10 +173,119 @@ def test_other_data_of_the_same_size_is_another_evaluation(clouds, tmp_path):
         evaluate(identity, "dcp", clouds + np.float32(1e-3), save=tmp_path / "values.npz", progress=False)
 
 
-def test_a_file_of_something_else_is_named(clouds, tmp_path):
-    (tmp_path / "values.npz").write_bytes(b"not an archive")
-    with pytest.raises(ValueError, match="holds no evaluation"):
-        evaluate(identity, "dcp", clouds, save=tmp_path / "values.npz", progress=False)
+def _archive(path, **changes) -> None:
+    """Changes what an evaluation's file holds; None leaves an array out."""
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files} | changes
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+
+
+def _described(path, **changes) -> None:
+    with np.load(path) as archive:
+        described = json.loads(str(archive["described"])) | changes
+    _archive(path, described=json.dumps({name: value for name, value in described.items() if value != "left out"}))
+
+
+def _flip_values(path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 255
+    path.write_bytes(content)
+
+
+_DAMAGES = {
+    "no archive": lambda path: path.write_bytes(b"not an archive"),
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-100]),
+    "flipped": _flip_values,
+    "an array alone": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00"),
+    "no rotations": lambda path: _archive(path, rotations=None),
+    "rotations of fewer items": lambda path: _archive(path, rotations=np.zeros((2, 3, 3))),
+    "translations of another shape": lambda path: _archive(path, translations=np.zeros((5, 4))),
+    "items that are text": lambda path: _archive(path, items=np.array(list("abcde"))),
+    "items without an axis": lambda path: _archive(path, items=np.array(3)),
+    "scales that are text": lambda path: _archive(path, scales=np.array(list("abcde"))),
+    "description that is no JSON": lambda path: _archive(path, described="{"),
+    "description that is a list": lambda path: _archive(path, described="[]"),
+    "description a thousand deep": lambda path: _archive(path, described="[" * 100_000),
+    "no failures": lambda path: _described(path, failures="left out"),
+    "failures that are nothing": lambda path: _described(path, failures=None),
+    "failure of no item": lambda path: _described(path, failures={"first": "no"}),
+    "no method": lambda path: _described(path, method="left out"),
+    "identity that is a list": lambda path: _described(path, identity=[]),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(clouds, tmp_path_factory):
+    """The file of a whole evaluation of ``identity``."""
+    path = tmp_path_factory.mktemp("whole") / "values.npz"
+    evaluate(identity, "dcp", clouds, save=path, progress=False)
+    return path
+
+
+@pytest.fixture
+def kept(whole, tmp_path):
+    """A copy of ``whole``, to be damaged."""
+    return Path(shutil.copy(whole, tmp_path / "values.npz"))
+
+
+@pytest.mark.parametrize("damage", _DAMAGES.values(), ids=_DAMAGES)
+def test_a_file_that_holds_no_evaluation_is_named(kept, damage):
+    damage(kept)
+    with pytest.raises(ValueError, match=r"values\.npz: holds no evaluation, or is damaged"):
+        load_evaluation(kept)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(ValueError, match="nothing: cannot be read"):
+        load_evaluation(tmp_path / "nothing")
+
+
+def test_what_a_file_holds_besides_does_not_matter(kept):
+    _archive(kept, more=np.zeros(3))
+    _described(kept, more="said")
+    assert len(load_evaluation(kept)) == 5
+
+
+def test_items_of_a_damaged_file_are_evaluated_anew_and_the_file_is_kept(clouds, kept):
+    kept.write_bytes(b"not an archive")
+    with pytest.warns(UserWarning, match=r"all items are evaluated anew, and the file is now values\.npz\.damaged"):
+        found = evaluate(identity, "dcp", clouds, save=kept, progress=False)
+    assert len(found) == len(load_evaluation(kept)) == 5
+    assert kept.with_name("values.npz.damaged").read_bytes() == b"not an archive"
+
+
+@pytest.mark.parametrize("answer", [None, np.eye(3), [1, 2], [[1], [2, 3]], "text"], ids=str)
+def test_a_function_that_gives_no_matrix_fails_with_a_sentence(clouds, answer):
+    found = evaluate(lambda source, target: answer, "dcp", clouds, items=np.array([0]), progress=False)
+    assert "instead of a matrix (4, 4)" in found.failures[0]
+
+
+def test_a_method_that_gives_other_arrays_fails_with_a_sentence(clouds):
+    class Single:
+        title, batch = "single", 1
+
+        def identity(self):
+            return {}
+
+        def align(self, sources, targets):
+            return Poses(np.eye(3), np.zeros(3), np.ones(1), np.ones(1))
+
+    found = evaluate(Single(), "dcp", clouds, items=np.array([0]), progress=False)
+    assert found.failures[0].startswith("ValueError: the method gave arrays of shapes [(3, 3), (3,), (1,), (1,)]")
+
+
+def test_a_function_may_give_a_matrix_as_lists(clouds):
+    found = evaluate(lambda source, target: np.eye(4).tolist(), "dcp", clouds, items=np.array([0]), progress=False)
+    assert not found.failures
+
+
+def test_a_failure_without_a_message_has_a_reason(clouds):
+    def fails(source, target):
+        raise AssertionError
+
+    found = evaluate(fails, "dcp", clouds, items=np.array([0]), progress=False)
+    assert found.failures == {0: "AssertionError: without a message"}
 
 
 def test_some_rows_can_be_looked_at_alone(clouds):
@@ -221,7 +332,7 @@ def test_items_are_spread_evenly(count, limit, stride, expected):
     np.testing.assert_array_equal(spread(count, limit, stride), expected)
 
 
-@pytest.mark.parametrize("data", [([], []), "shapes", np.zeros((3, 2))])
+@pytest.mark.parametrize("data", [([], []), "shapes", np.zeros((3, 2)), None])
 def test_data_that_is_no_array_of_shapes_is_named(data):
     with pytest.raises(ValueError, match="data: expected an array"):
         evaluate("identity", "dcp", data, progress=False)
@@ -236,6 +347,9 @@ def test_data_that_is_no_array_of_shapes_is_named(data):
         ({"items": np.array([], int)}, "items"),
         ({"items": np.array([5])}, r"indices in 0\.\.4"),
         ({"items": np.array([-1])}, r"indices in 0\.\.4"),
+        ({"items": np.array([0.5])}, "items: expected whole numbers"),
+        ({"items": np.array(1)}, "items: expected whole numbers"),
+        ({"protocol": "scans"}, "data: expected the trials of load_scan_pairs"),
         ({"batch": 0}, "batch"),
     ],
 )

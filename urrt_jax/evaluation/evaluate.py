@@ -3,8 +3,9 @@
 import dataclasses
 import hashlib
 import json
+import os
 import time
-import zipfile
+import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -117,10 +118,36 @@ def load_evaluation(path: str | Path) -> Evaluation:
         with np.load(path, allow_pickle=False) as archive:
             described = json.loads(str(archive["described"]))
             values = {name: archive[name] for name in _ARRAYS}
-    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path}: holds no evaluation ({error})") from error
-    failures = {int(item): reason for item, reason in described.pop("failures").items()}
-    return Evaluation(**values, **described, failures=failures)
+        for name in ("method", "protocol"):
+            _check_kind(name, described[name], str)
+        for name in ("failures", "identity"):
+            _check_kind(name, described[name], dict)
+        failures = {int(item): str(reason) for item, reason in described["failures"].items()}
+        _check_values(values)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # NumPy, zipfile and zlib raise many kinds for damaged archives
+        raise ValueError(f"{path}: holds no evaluation, or is damaged ({type(error).__name__}: {error})") from error
+    named = {name: described[name] for name in ("method", "protocol", "identity")}
+    return Evaluation(**values, **named, failures=failures)
+
+
+def _check_kind(name: str, value: Any, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise ValueError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+
+
+def _check_values(values: dict[str, np.ndarray]) -> None:
+    """Refuses arrays of other shapes or kinds than ``Evaluation`` says."""
+    rows = values["items"].shape
+    shapes = dict.fromkeys(_ARRAYS, ()) | {"rotations": (3, 3), "true_rotations": (3, 3)}
+    shapes |= {"translations": (3,), "true_translations": (3,)}
+    for name, value in values.items():
+        expected = (*rows, *shapes[name])
+        if len(rows) != 1 or value.shape != expected:
+            raise ValueError(f"{name}: expected shape {expected if len(rows) == 1 else '(B,)'}, got {value.shape}")
+        if value.dtype.kind not in ("iu" if name == "items" else "iuf"):
+            raise ValueError(f"{name}: expected numbers, got dtype {value.dtype}")
 
 
 def evaluate(
@@ -137,7 +164,8 @@ def evaluate(
 
     Our methods run in batches, others pair by pair. An item on which the method raises, or gives values that are
     not finite, is scored as the identity and listed in ``failures``. With ``save`` the values are kept in a ``.npz``
-    all along, also when the run is interrupted, and the same call continues after the last item there.
+    all along, also when the run is interrupted, and the same call continues after the last item there. Where that file
+    can't be read, it is renamed, and all items are evaluated anew, with a warning.
 
     Args:
       method: a name as ``find_method`` takes it, a ``Model``, or a function from a source (N, 3)
@@ -155,11 +183,10 @@ def evaluate(
       ImportError: the method needs a library that is not installed; the message says how to install it.
     """
     method, make = find_method(method), find_protocol(protocol)
-    if protocol.split()[0] != "scans" and not (isinstance(data, np.ndarray) and data.ndim == 3 and data.shape[2] == 3):
-        raise ValueError(
-            f"data: expected an array (S, P, 3) of shapes, got {getattr(data, 'shape', type(data).__name__)}"
-        )
+    _check_data(protocol, data)
     chosen = np.arange(len(data)) if items is None else np.asarray(items)
+    if chosen.ndim != 1 or (len(chosen) and chosen.dtype.kind not in "iu"):
+        raise ValueError(f"items: expected whole numbers, (B,), got shape {chosen.shape} and dtype {chosen.dtype}")
     if len(chosen) == 0:
         raise ValueError("items: there is nothing to evaluate")
     if chosen.min() < 0 or chosen.max() >= len(data):
@@ -170,8 +197,8 @@ def evaluate(
     identity = json.loads(json.dumps(method.identity() | {"protocol": protocol, "data": data_digest(data)}))
 
     parts, kept = [], 0
-    if save is not None and Path(save).exists():
-        before = load_evaluation(save)
+    before = None if save is None or not Path(save).exists() else _load_or_set_aside(Path(save))
+    if before is not None:
         if before.identity != identity or not np.array_equal(before.items, chosen[: len(before)]):
             raise ValueError(f"{save}: holds another evaluation; remove it or choose another name")
         parts, kept = [before], len(before)
@@ -196,6 +223,26 @@ def evaluate(
         if save is not None and done > kept:
             _join(parts).save(save)
     return _join(parts)
+
+
+def _check_data(protocol: str, data: Any) -> None:
+    found = getattr(data, "shape", type(data).__name__)
+    if protocol.split()[0] == "scans":
+        if not (isinstance(data, Sequence) and all(isinstance(each, Trial) for each in data)):
+            raise ValueError(f"data: expected the trials of load_scan_pairs, got {found}")
+    elif not (isinstance(data, np.ndarray) and data.ndim == 3 and data.shape[2] == 3):
+        raise ValueError(f"data: expected an array (S, P, 3) of shapes, got {found}")
+
+
+def _load_or_set_aside(path: Path) -> Evaluation | None:
+    """The evaluation in a file; None where it can't be read: then it is renamed, with a warning."""
+    try:
+        return load_evaluation(path)
+    except ValueError as error:
+        aside = path.with_name(path.name + ".damaged")
+        os.replace(path, aside)
+        warnings.warn(f"{error}; all items are evaluated anew, and the file is now {aside.name}", stacklevel=3)
+        return None
 
 
 def values_path(folder: Path, name: str, method: Method, protocol: str, data: Any, items: np.ndarray) -> Path:
@@ -254,7 +301,7 @@ def _evaluate_part(
 def _align(method: Method, trials: Sequence[Trial], items: Sequence[int]) -> tuple[Poses, dict[int, str]]:
     """The poses of all trials, the identity where there is none, and the failures by item."""
     poses, reasons = _try(method, trials)
-    rotation, translation = np.array(poses.rotation, np.float64), np.array(poses.translation, np.float64)
+    rotation, translation = poses.rotation.copy(), poses.translation.copy()
     finite = np.asarray(np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1))
     rotation[~finite] = 0.0
     off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
@@ -265,23 +312,34 @@ def _align(method: Method, trials: Sequence[Trial], items: Sequence[int]) -> tup
         for row, item in enumerate(items)
         if broken[row]
     }
-    said = (np.array(value, np.float64) for value in (poses.fitness, poses.converged))
-    return Poses(rotation, translation, *said), failures
+    return Poses(rotation, translation, poses.fitness, poses.converged), failures
 
 
 def _try(method: Method, trials: Sequence[Trial]) -> tuple[Poses, dict[int, str]]:
     """The poses, NaN where the method raised, and why, by row; a batch that raises is tried again one by one."""
     try:
         informed = {"expected": [trial.expected for trial in trials]} if getattr(method, "informed", False) else {}
-        return method.align([trial.source for trial in trials], [trial.target for trial in trials], **informed), {}
+        poses = method.align([trial.source for trial in trials], [trial.target for trial in trials], **informed)
+        return _checked_poses(poses, len(trials)), {}
     except Exception as error:  # a method may raise anything; it is counted, not hidden
         if len(trials) == 1:
             nothing = np.full(1, np.nan)
             poses = Poses(np.full((1, 3, 3), np.nan), np.full((1, 3), np.nan), nothing, nothing)
-            return poses, {0: f"{type(error).__name__}: {error}"}
+            return poses, {0: f"{type(error).__name__}: {str(error) or 'without a message'}"}
     singles = [_try(method, [trial]) for trial in trials]
     poses = Poses(*(np.concatenate(values) for values in zip(*(pose for pose, _ in singles), strict=True)))
     return poses, {row: reasons[0] for row, (_, reasons) in enumerate(singles) if reasons}
+
+
+def _checked_poses(poses: Any, count: int) -> Poses:
+    """The poses in float64, if they are ``count``."""
+    if not (isinstance(poses, tuple) and len(poses) == 4):
+        raise ValueError(f"the method gave {type(poses).__name__}, expected Poses")
+    checked = Poses(*(np.asarray(each, np.float64) for each in poses))
+    shapes, expected = [each.shape for each in checked], [(count, 3, 3), (count, 3), (count,), (count,)]
+    if shapes != expected:
+        raise ValueError(f"the method gave arrays of shapes {shapes}, expected {expected}")
+    return checked
 
 
 def _compare(trials: Sequence[Trial], poses: Poses, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -149,10 +149,21 @@ class PairByPair:
     def align(self, sources: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Poses:
         pairs = zip(sources, targets, strict=True)
         found = np.stack(
-            [self.function(source.astype(np.float64), target.astype(np.float64)) for source, target in pairs]
+            [self._matrix(source.astype(np.float64), target.astype(np.float64)) for source, target in pairs]
         )
         unknown = np.full(len(found), np.nan)
         return Poses(found[:, :3, :3], found[:, :3, 3], unknown, unknown)
+
+    def _matrix(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        answer = self.function(source, target)
+        try:
+            matrix = np.asarray(answer, np.float64)
+        except (TypeError, ValueError):
+            matrix = None
+        if matrix is None or matrix.shape != (4, 4):
+            found = type(answer).__name__ if not np.ndim(matrix) else f"an array of shape {np.shape(matrix)}"
+            raise ValueError(f"{self.title} gave {found} instead of a matrix (4, 4)")
+        return matrix
 
 
 def find_method(method: "str | Method | Model | Peer | Callable", *, model: str | Path = "modelnet40") -> Method:

@@ -3,7 +3,6 @@
 import hashlib
 import itertools
 import os
-import zipfile
 from io import BytesIO
 from pathlib import Path
 
@@ -41,8 +40,10 @@ def load_scan_pairs(
             clouds = [np.asarray(archive[f"pts_{name}"], np.float64) for name in names]
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: needs names, pose_to_world and pts_<name> of every scan ({error})") from error
+    except Exception as error:  # NumPy, zipfile and zlib raise many kinds for damaged archives
+        raise ValueError(
+            f"{path}: needs names, pose_to_world and pts_<name> of every scan ({type(error).__name__}: {error})"
+        ) from error
     if poses.shape != (len(names), 4, 4):
         raise ValueError(f"{path}: expected pose_to_world of shape ({len(names)}, 4, 4), got {poses.shape}")
 
@@ -74,10 +75,10 @@ def _cached_overlaps(digest: str, clouds: list[np.ndarray], poses: np.ndarray, r
     kept = folder / f"overlaps_{digest}.npy"
     try:
         cached = np.load(kept, allow_pickle=False)
+        if cached.shape == (len(clouds), len(clouds)) and cached.dtype == np.float64:
+            return cached
     except (OSError, ValueError, EOFError):
         pass
-    else:
-        return cached
     overlaps = _overlaps(clouds, poses, reach)
     try:
         folder.mkdir(parents=True, exist_ok=True)
