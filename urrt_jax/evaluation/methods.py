@@ -159,11 +159,12 @@ class PairByPair:
         try:
             matrix = np.asarray(answer, np.float64)
         except (TypeError, ValueError):
-            matrix = None
-        if matrix is None or matrix.shape != (4, 4):
-            found = type(answer).__name__ if not np.ndim(matrix) else f"an array of shape {np.shape(matrix)}"
-            raise ValueError(f"{self.title} gave {found} instead of a matrix (4, 4)")
-        return matrix
+            found = type(answer).__name__
+        else:
+            if matrix.shape == (4, 4):
+                return matrix
+            found = f"an array of shape {matrix.shape}" if matrix.ndim else type(answer).__name__
+        raise ValueError(f"{self.title} gave {found} instead of a matrix (4, 4)")
 
 
 def find_method(method: "str | Method | Model | Peer | Callable", *, model: str | Path = "modelnet40") -> Method:
