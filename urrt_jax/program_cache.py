@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jax.experimental import serialize_executable
 
-from urrt_jax.atomic import write_atomically
+from urrt_jax.atomic import UNFINISHED, write_atomically
 
 _PACKAGE = __name__.partition(".")[0]
 # Tracing runs code of these too.
@@ -87,7 +87,7 @@ def cached_files() -> tuple[Path, dict[Path, int]]:
     """
     root = _default_folder().parent
     sizes = {}
-    for path in [*root.glob(f"programs/*{_SUFFIX}*"), *root.glob("jax/*/*")]:
+    for path in [*_entries(root / "programs"), *root.glob("jax/*/*")]:
         with contextlib.suppress(OSError):  # another process has just removed it
             sizes[path] = path.stat().st_size
     return root, sizes
@@ -240,10 +240,14 @@ def _header(payload: bytes | memoryview) -> bytes:
     return _FORMAT + b" " + hashlib.sha256(payload).hexdigest().encode() + b"\n"
 
 
+def _entries(folder: Path) -> list[Path]:
+    """The programs in a folder, and what killed processes have left of others."""
+    return [*folder.glob(f"*{_SUFFIX}"), *folder.glob(f".*{UNFINISHED}")]
+
+
 def _remove_least_recently_used(cache: _Cache) -> None:
     entries = []
-    # What a killed process left unfinished has the suffix inside its name.
-    for path in cache.folder.glob(f"*{_SUFFIX}*"):
+    for path in _entries(cache.folder):
         try:
             entries.append((path.stat().st_mtime_ns, path.stat().st_size, path))
         except OSError:  # another process has just removed it

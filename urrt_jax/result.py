@@ -184,5 +184,5 @@ def _in_words(result: Registration) -> str:
 
 
 def rotation_deviation(covariance: ArrayLike) -> float:
-    """The standard deviation of the rotation, in degrees, of a pose with this covariance (6, 6)."""
-    return float(np.rad2deg(np.sqrt(np.trace(np.asarray(covariance)[3:, 3:]))))
+    """The standard deviation of the rotation, in degrees, of a pose with this covariance (6, 6); at most 180."""
+    return min(float(np.rad2deg(np.sqrt(np.trace(np.asarray(covariance)[3:, 3:])))), 180.0)

@@ -35,10 +35,10 @@ def test_json_has_versions_devices_models_cache_and_extras(cache, capsys):
 
 
 def test_text_says_how_to_get_what_is_missing(capsys, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "plotly" else object())
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "matplotlib" else object())
     assert cli.main(["info"]) == 0
     out = capsys.readouterr().out
-    assert "missing plotly: pip install 'urrt-jax[viz]'" in out
+    assert "missing matplotlib: pip install 'urrt-jax[viz]'" in out
     assert "3 compiled programs" in out and str(urrt_jax.model_card()["limits"]) in out
 
 

@@ -47,7 +47,8 @@ def scans(tmp_path, monkeypatch) -> Path:
     for name in ("scans/a.ply", "scans/b.xyz", "scans/c.npy", "scans/.hidden.ply", "model.ply"):
         io.write_cloud(tmp_path / name, cloud)
     io.write_cloud(tmp_path / "far.ply", cloud + 20)
-    (tmp_path / "scans" / "notes.txt").write_text("none of ours")
+    for name in ("notes.txt", "notes.md"):
+        (tmp_path / "scans" / name).write_text("none of ours")
     return tmp_path
 
 
@@ -73,6 +74,19 @@ def test_a_folder_gives_a_row_for_every_readable_file_in_order(files, scans, cal
     assert folder_run(files) == 0
     assert [row["source"] for row in rows()] == ["scans/a.ply", "scans/b.xyz", "scans/c.npy"]
     assert {row["target"] for row in rows()} == {"model.ply"}
+
+
+def test_text_files_that_may_be_no_clouds_are_left_out_of_a_folder_and_counted(files, scans, calls, capsys):
+    folder_run(files)
+    assert "left out, because they may be no clouds: 1 .txt or .csv" in capsys.readouterr().err
+
+
+def test_a_folder_of_text_files_alone_is_registered(files, scans, calls):
+    (scans / "texts").mkdir()
+    for name in ("one.csv", "two.txt"):
+        io.write_cloud(scans / "texts" / name, np.random.default_rng(0).normal(size=(100, 3)))
+    assert run(files, "texts", "--to", "model.ply", "--out", "results.csv") == 0
+    assert [row["source"] for row in rows()] == ["texts/one.csv", "texts/two.txt"]
 
 
 def test_the_target_is_none_of_the_sources(files, scans, calls):
@@ -116,14 +130,15 @@ def test_names_with_commas_quotes_and_umlauts_survive(files, scans, calls):
     ("line", "reason"),
     [
         ("missing.ply,model.ply", "missing.ply: no such file"),
-        ("scans/notes.txt,model.ply", "unknown extension"),
+        ("scans/notes.md,model.ply", "unknown extension"),
+        ("scans/notes.txt,model.ply", "notes.txt: line 1: expected numbers"),
         ("broken.ply,model.ply", "broken.ply: "),
         ("scans/a.ply,", "line 3 of the table names no target"),
         ("scans/a.ply,model.ply,more,", "line 3 of the table has more cells"),
         ("scans,model.ply", "scans: unknown extension"),
         ("nul\0.ply,model.ply", "no such file"),
     ],
-    ids=["missing", "extension", "damaged", "no target", "too many cells", "a folder", "null byte"],
+    ids=["missing", "extension", "text", "damaged", "no target", "too many cells", "a folder", "null byte"],
 )
 def test_a_bad_pair_gets_its_reason_and_stops_no_other(files, scans, calls, capsys, line, reason):
     Path("broken.ply").write_text("no cloud")

@@ -9,8 +9,8 @@ from typing import Any
 _VERSIONS = ("jax", "jaxlib", "flax", "numpy")
 # What each extra is for, and the modules by which it is told.
 _EXTRAS = {
-    "viz": ("pictures", ("matplotlib", "plotly")),
-    "data": ("HDF5 data sets and .pcd files", ("h5py", "pypcd4")),
+    "viz": ("pictures", ("matplotlib",)),
+    "data": ("HDF5 data sets, .pcd, .las and .laz files", ("h5py", "pypcd4", "laspy", "lazrs")),
     "peers": ("other methods of 'urrt evaluate'", ("open3d", "small_gicp", "kiss_matcher", "jaxkd")),
 }
 

@@ -45,6 +45,7 @@ reading, in a batch the pair's share. ``options`` says what the pair was registe
 the sizes and times of its files and of the initial transform: by these a later run knows what need not be done again.
 """
 
+_ANY_TEXT = (".csv", ".txt")
 _SMALL = 4096  # points up to which register_pairs works in batches
 _BATCH = 32  # pairs of a batch; register_pairs has the same on a CPU
 _AHEAD = 4  # pairs that are read while others are registered; more large clouds would only take memory
@@ -109,7 +110,8 @@ def _pair_of_row(folder: Path, row: Mapping[Any, Any], line: int) -> Pair:
 def pairs_of_folder(folder: Path, target: Path, initial: Path | None, *, out: Path | None) -> list[Pair]:
     """Every readable file of a folder, by name, with one target.
 
-    The target itself, the results in ``out`` and hidden files are left out.
+    The target itself, the results in ``out`` and hidden files are left out. So are .txt and .csv files beside files of
+    other formats, because they may hold anything; stderr says how many these are.
 
     Raises:
       ValueError: the folder holds no such file.
@@ -119,6 +121,10 @@ def pairs_of_folder(folder: Path, target: Path, initial: Path | None, *, out: Pa
     sources = [path for path in files if path.suffix.lower() in READABLE and not path.name.startswith(".")]
     if not sources:
         raise ValueError(f"{folder}: holds no file to register, of {', '.join(READABLE)}")
+    clouds = [path for path in sources if path.suffix.lower() not in _ANY_TEXT]
+    if clouds and len(clouds) < len(sources):
+        note(f"left out, because they may be no clouds: {len(sources) - len(clouds)} .txt or .csv; see --pairs")
+        sources = clouds
     return [Pair(str(source), str(target), (source, target, initial)) for source in sources]
 
 

@@ -39,7 +39,8 @@ class Register:
     Attributes:
         source: File of the cloud that moves, or with --to a folder of such files.
         target: File of the cloud that stays.
-        to: The target of all files in the folder SOURCE, which are registered in the order of their names.
+        to: The target of all files in the folder SOURCE, which are registered in the order of their names. Files named
+            .txt or .csv are left out if the folder has others.
         pairs: Table of pairs (CSV): columns source, target and, where known, initial, a file of a rough transform.
             Relative paths are relative to the table's folder.
         json: Print one JSON object: matrix, rotation, translation, fitness, rmse, overlap, confidence, converged,

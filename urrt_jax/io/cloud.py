@@ -1,7 +1,5 @@
 """A point cloud as files hold it: points, and normals and colours where there are some."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
