@@ -28,6 +28,7 @@ _PACKAGE = __name__.partition(".")[0]
 _BUILT_ON = ("jax", "jaxlib", "flax", "optax", "jaxlie", "numpy")
 _FORMAT = b"urrt_jax program 1"
 _SUFFIX = ".program"
+_JITTED = "jax"
 # Events that JAX records.
 _JAX_CACHE_ASKED = "/jax/compilation_cache/compile_requests_use_cache"
 _JAX_CACHE_HIT = "/jax/compilation_cache/cache_hits"
@@ -42,7 +43,9 @@ _cache: _Cache | None = None
 _Device = Any  # jax.Device, which pyright doesn't take for a type
 
 
-def use_compilation_cache(folder: str | os.PathLike[str] | None = None, *, max_bytes: int = 2**29) -> Path | None:
+def use_compilation_cache(
+    folder: str | os.PathLike[str] | None = None, *, max_bytes: int = 2**29, jitted: bool = False
+) -> Path | None:
     """The folder that keeps compiled programs from now on in this process, or None if it can't be made or read.
 
     None also where the environment variable ``URRT_NO_CACHE`` is set and no folder is named.
@@ -53,6 +56,8 @@ def use_compilation_cache(folder: str | os.PathLike[str] | None = None, *, max_b
     Args:
       folder: by default ``$XDG_CACHE_HOME/urrt_jax/programs``, or ``~/.cache/urrt_jax/programs``.
       max_bytes: when all entries together are larger, the least recently used are removed.
+      jitted: whether to keep also what you jit yourself, and the steps of training. JAX's own cache does that, in the
+        folder's ``jax``, without a bound; these functions are traced anew in each process.
 
     Raises:
       ValueError: ``max_bytes`` is negative.
@@ -72,7 +77,18 @@ def use_compilation_cache(folder: str | os.PathLike[str] | None = None, *, max_b
         return None
     _listen_to_jax_cache()
     _cache = _Cache(folder, max_bytes)
+    if jitted:
+        _use_jax_cache(folder / _JITTED / f"{jax.lib.__version__}-{processor()}")
     return folder
+
+
+def _use_jax_cache(folder: Path) -> None:
+    """From now on JAX keeps all that it compiles in this folder, if that can be made."""
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def _default_folder() -> Path:
@@ -85,9 +101,9 @@ def cached_files() -> tuple[Path, dict[Path, int]]:
     Raises:
       RuntimeError: there is no home folder.
     """
-    root = _default_folder().parent
+    root = _default_folder()
     sizes = {}
-    for path in [*_entries(root / "programs"), *root.glob("jax/*/*")]:
+    for path in [*_entries(root), *root.glob(f"{_JITTED}/*/*")]:
         with contextlib.suppress(OSError):  # another process has just removed it
             sizes[path] = path.stat().st_size
     return root, sizes

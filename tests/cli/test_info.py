@@ -15,7 +15,7 @@ def cache(tmp_path, monkeypatch):
     """A cache folder with two programs, one thing of training, and one file that is none of ours."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     root = tmp_path / "urrt_jax"
-    for name in ("programs/a.program", "programs/b.program", "jax/0.10-abc/step", "programs/notes.txt"):
+    for name in ("programs/a.program", "programs/b.program", "programs/jax/0.10-abc/step", "programs/notes.txt"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes(bytes(500))
     return root
@@ -30,7 +30,7 @@ def test_json_has_versions_devices_models_cache_and_extras(cache, capsys):
     assert found["versions"]["python"] == platform.python_version()
     assert found["devices"]
     assert list(found["models"]) == urrt_jax.available_models()
-    assert found["cache"] == {"folder": str(cache), "programs": 3, "bytes": 1500}
+    assert found["cache"] == {"folder": str(cache / "programs"), "programs": 3, "bytes": 1500}
     assert found["extras"].keys() == {"viz", "data", "peers"}
 
 

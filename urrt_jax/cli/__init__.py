@@ -122,21 +122,6 @@ def _keep_compiled_programs(command: Any) -> None:
     # hints for instructions that the processor lacks; programs for other processors have other names.
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
     from urrt_jax.cli.train import Train
-    from urrt_jax.program_cache import processor, use_compilation_cache
+    from urrt_jax.program_cache import use_compilation_cache
 
-    folder = use_compilation_cache()
-    if folder is None or not isinstance(command, Train):
-        return
-    # The steps of training are no programs of ours, but jitted functions, which JAX itself can keep.
-    from importlib.metadata import version
-
-    import jax
-
-    folder = folder.parent / "jax" / f"{version('jaxlib')}-{processor()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    use_compilation_cache(jitted=isinstance(command, Train))  # the steps of training are jitted
