@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from urrt_jax.warming import warm_up
     from urrt_jax.weights import available_models, load_model, model_card, save_model
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "ICP",

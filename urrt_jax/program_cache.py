@@ -50,6 +50,10 @@ def use_compilation_cache(
 
     None also where the environment variable ``URRT_NO_CACHE`` is set and no folder is named.
 
+    On a CPU XLA logs a harmless error, of many lines, for every program that it loads: it takes two tuning hints for
+    instructions that the processor lacks. The environment variable ``TF_CPP_MIN_LOG_LEVEL=3``, set before JAX is
+    imported, keeps it quiet.
+
     Entries are unpickled, and unpickling can run any code: the folder must belong to the user, and nobody else may
     write to it. A new folder gets mode 0700. A folder that can only be read is used, but nothing is added to it.
 
@@ -78,7 +82,8 @@ def use_compilation_cache(
     _listen_to_jax_cache()
     _cache = _Cache(folder, max_bytes)
     if jitted:
-        _use_jax_cache(folder / _JITTED / f"{jax.lib.__version__}-{processor()}")
+        jaxlib = importlib.metadata.version("jaxlib")
+        _use_jax_cache(folder / _JITTED / f"{jaxlib}-{processor()}")
     return folder
 
 

@@ -48,9 +48,9 @@ def register(
     common radius; a search over all poses takes over where that does not fit; refinement makes it exact on the full
     clouds. The rotation is the same for any common unit and any origin of either cloud. A pure function: the same input
     gives the same answer, and ``jax.jit``, ``jax.vmap`` and ``jax.grad`` compose with it. Derivatives with respect to
-    the clouds and to the numbers in ``refine`` are those of the pose at which refinement ends, correspondences held
-    fixed; without refinement they pass through the network's last step, then also to the model's parameters; a search
-    without refinement has none.
+    the clouds and to the numbers in ``refine`` are those of the refined pose, with correspondences held fixed. With
+    ``refine=None, search=None`` they pass through the network's last step, and reach the model's parameters, too. The
+    pose of a search without refinement has none.
 
     On arrays, each stage is compiled by itself, once for each rung of a ladder of sizes (256, 1,024, 4,096, 16,384, …
     points): the next pair of any sizes on that rung compiles nothing. ``warm_up`` compiles ahead of time and
@@ -58,9 +58,9 @@ def register(
     shapes at hand, which takes far longer to compile.
 
     Args:
-      source: (N, 3) real numbers, any unit. NumPy arrays of float64 or integers are centred before they become float32,
-        and the translation of the result is then NumPy float64: a far origin (map coordinates) costs no digits. A cloud
-        of Open3D, trimesh or pyvista is taken by its points, a mesh by its vertices.
+      source: (N, 3) real numbers, any unit. NumPy float64 is centred before it becomes float32, and the translation of
+        the result is then NumPy float64: a far origin (map coordinates) costs no digits. A cloud of Open3D, trimesh or
+        pyvista is taken by its points, a mesh by its vertices (``urrt_jax.io.read_cloud`` samples its surface instead).
       target: (M, 3), the same unit.
       source_mask: (N,) bool, False for padding; None when every point is real.
       target_mask: (M,) bool.
@@ -68,10 +68,10 @@ def register(
       refine: how to refine, after at most two of the network's steps; None returns the network's estimate after all of
         them, or the search's.
       search: how to look for the pose among all poses. "auto" searches only where the network's estimate, refined on a
-        subsample of 512 points, does not fit. That look costs little; a search takes as long as the rest together, and
-        much longer where it must be compiled first. "auto" does nothing where ``refine`` is None. A ``Search`` always
-        searches; None never does. Among poses that fit about alike it prefers what
-        turns less from where the clouds are: a symmetric shape is not turned around.
+        subsample of 512 points, does not fit. This check is cheap. A search takes about as long as the rest of the
+        registration, and much longer where it must be compiled first. "auto" does nothing where ``refine`` is None. A
+        ``Search`` always searches; None never does. Among poses that fit about alike "auto" prefers the one that turns
+        less: a symmetric shape is not turned around.
       initial: (4, 4), a rough transform from source to target where one is known, as from odometry or a turntable: the
         network and the search begin with the source moved by it, and largest angles count from it. No derivative
         passes to it.

@@ -12,11 +12,27 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from urrt_jax import rigid
+from urrt_jax.clouds import CloudLike, as_array
 from urrt_jax.rigid import Rigid
+
+UNKNOWN_DEVIATION = 90.0
+"""A standard deviation of the rotation, in degrees, from which on nothing is known of it."""
 
 
 class Outcome(enum.IntEnum):
-    """How a registration ended; ``Registration.reason`` says what each of these means."""
+    """How a registration ended. ``Registration.reason`` says it in words.
+
+    Attributes:
+      CONVERGED: the pose may be used.
+      DEGENERATE: a cloud has fewer than three usable points, or all of them lie on one line.
+      INITIAL: under ``jit``, the initial transform is not finite.
+      DIGITS: float32 coordinates lie so far from the origin that they have lost their digits. Pass NumPy float64.
+      UNSETTLED: refinement did not come to rest: little overlap, a wrong unit, or round objects.
+      MISFIT: too little of the clouds lies on each other: a wrong pose, little overlap, or two objects.
+      AMBIGUOUS: another pose fits about as well: the object is symmetric. ``alternatives`` holds other poses.
+      REFUSED: ``register`` raises a ``ValueError`` for these clouds; ``reasons`` of ``register_pairs`` has its message.
+      UNDETERMINED: too few points touch, or they are too noisy: ``covariance`` says how little is known.
+    """
 
     CONVERGED = 0
     DEGENERATE = 1
@@ -44,7 +60,7 @@ _REASONS = {
 
 
 class OtherPoses(NamedTuple):
-    """K other poses in which the clouds lie on each other, best first; K is 4, and those that are none weigh nothing.
+    """K other poses in which the clouds lie on each other, best first; K is 4, and unused entries have weight 0.
 
     Attributes:
       rotation: (K, 3, 3).
@@ -92,9 +108,9 @@ class Registration:
       inlier_distance: (), the distance that was used, in the input's units.
       overlap: (2,), the share of the source's points that lie within 1.5 spacings (the coarser cloud's) of the target,
         and of the target's (up to 4096 of them) that lie as near the source.
-      confidence: (), in [0, 1]: how sure it is that the rotation is right within 5°: that surfaces lie on each other
-        rather than cross, that no other pose fits as well, and that the points are enough to determine the pose. The
-        product of these three, each learned on training shapes. Low for symmetric shapes and for few points.
+      confidence: (), in [0, 1], the estimated probability that the rotation is within 5° of the true one: the product
+        of three probabilities, learned on training shapes. Surfaces lie on each other rather than cross; no other pose
+        fits as well; the points are enough to determine the pose. Low for symmetric shapes and for few points.
       converged: (), bool: the input was finite, not collinear, and not so far from the origin that float32 lost its
         digits; refinement came to rest within its iterations (where there was refinement); and the confidence is at
         least 0.5.
@@ -156,8 +172,9 @@ class Registration:
         """The transform as an element of SE(3), in float32."""
         return jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(self.rotation), self.translation)
 
-    def apply(self, points: ArrayLike) -> Array:
-        """The moved points, (..., 3); in float64, on the host, where the translation is."""
+    def apply(self, points: CloudLike) -> Array:
+        """The moved points, (..., 3), of an array or another library's cloud; NumPy float64 if the translation is."""
+        points = as_array(points, "points")
         shift = self.translation[..., None, :] if self.translation.ndim > 1 else self.translation
         if isinstance(self.translation, np.ndarray):
             turn = np.swapaxes(np.asarray(self.rotation, np.float64), -1, -2)
@@ -178,7 +195,7 @@ def _in_words(result: Registration) -> str:
         return f"{reason}: turned by {np.rad2deg(angle):.0f}° about the direction ({axis})"
     if outcome == Outcome.UNDETERMINED:
         deviation = rotation_deviation(result.covariance)
-        known = 2 < deviation < 180
+        known = 2 < deviation < UNKNOWN_DEVIATION
         return f"{reason}: the standard deviation of its rotation is {deviation:.1f}°" if known else reason
     return reason
 

@@ -22,6 +22,9 @@ def test_demo_without_matplotlib_prints_the_result_and_says_how_to_get_the_pictu
     monkeypatch.setattr("urrt_jax.cli.outputs.has_matplotlib", lambda: False)
     out = tmp_path / "demo.png"
     assert cli.main(["demo", "--model", str(files["model.npz"]), "--out", str(out)]) == 0
+    page = tmp_path / "demo.html"
+    assert cli.main(["demo", "--model", str(files["model.npz"]), "--view", str(page)]) == 0
+    assert "urrt demo" in page.read_text()  # the page needs no Matplotlib
     captured = capsys.readouterr()
     assert not out.exists()
     assert "against the truth" in captured.out and "pip install 'urrt-jax[viz]'" in captured.err

@@ -23,6 +23,7 @@ class Demo:
 
     Attributes:
         out: Where to write the picture of before and after.
+        view: Write a page here (.html) that shows both clouds in a browser.
         seed: Of the pose, the noise and the cut: another number, another trial.
         noise: Standard deviation of the noise on every coordinate; the shape has radius 1.
         keep: Share of the source that is left, in (0, 1].
@@ -30,6 +31,7 @@ class Demo:
     """
 
     out: Path = Path("demo.png")
+    view: Path | None = None
     seed: int = 0
     noise: float = 0.01
     keep: float = 0.8
@@ -41,11 +43,14 @@ class Demo:
 
         from urrt_jax import ICP, load_model, register
         from urrt_jax.cli.compiling import compile_for
-        from urrt_jax.cli.outputs import check_outputs, check_picture, has_matplotlib
+        from urrt_jax.cli.outputs import check_outputs, check_page, check_picture, has_matplotlib
         from urrt_jax.cli.printing import as_table, write_picture
         from urrt_jax.cli.streams import note, show
         from urrt_jax.evaluation.metrics import rotation_degrees
+        from urrt_jax.viewer import save_page
 
+        check_outputs({"--view": self.view})
+        check_page(self.view, "--view")
         if drawn := has_matplotlib():
             check_outputs({"--out": self.out})
             check_picture(self.out, "--out")
@@ -65,6 +70,9 @@ class Demo:
             note(f"wrote {self.out}")
         else:
             note("no picture was drawn: pictures need Matplotlib: pip install 'urrt-jax[viz]'")
+        if self.view is not None:
+            save_page(self.view, source, target, result, title="urrt demo")
+            note(f"wrote {self.view}")
         return 0
 
 

@@ -47,6 +47,12 @@ def check_picture(path: Path | None, flag: str) -> None:
         raise ImportError(f"{flag}: pictures need Matplotlib: pip install 'urrt-jax[viz]'")
 
 
+def check_page(path: Path | None, flag: str) -> None:
+    """Nothing, if a page is written into a file of this name, or none is asked for; else a ``ValueError``."""
+    if path is not None and path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"{flag}: {path}: a page is written as .html")
+
+
 def has_matplotlib() -> bool:
     """Whether Matplotlib is installed."""
     from importlib.util import find_spec

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from urrt_jax.atomic import write_atomically
 from urrt_jax.evaluation.metrics import rotation_degrees
-from urrt_jax.result import Registration, rotation_deviation
+from urrt_jax.result import UNKNOWN_DEVIATION, Registration, rotation_deviation
 
 
 def as_dict(result: Registration) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def as_table(result: Registration) -> str:
 
 def _deviation(result: Registration) -> str:
     degrees = rotation_deviation(result.covariance)
-    return f"{degrees:.2g}°" if degrees < 90 else "unknown"
+    return f"{degrees:.2g}°" if degrees < UNKNOWN_DEVIATION else "unknown"
 
 
 def write_picture(path: Path, source: np.ndarray, target: np.ndarray, result: Registration) -> None:

@@ -46,9 +46,9 @@ class Register:
         json: Print one JSON object: matrix, rotation, translation, fitness, rmse, overlap, confidence, converged,
             reason, information, covariance, alternatives (matrix and weight of each). A number that is not finite is
             null. Of many pairs: pairs, converged, not_converged (counts by reason), failed, results (a list).
-        out: Write the moved source here, as .ply, .pcd, .xyz, .npy or another of these formats. It keeps the source's
-            colours and normals if the format holds them; without colours a .ply is coloured by region. Of many pairs:
-            write the results here (.csv) instead of on stdout.
+        out: Write the moved source here, as .ply, .pcd, .las, .laz, .xyz, .txt, .csv, .npy or .npz. It keeps the
+            source's colours and normals if the format holds them; without colours a .ply is coloured by region. Of many
+            pairs: write the results here (.csv) instead of on stdout.
         picture: Write a picture of before and after here (.png, .pdf or .svg).
         view: Write a page here (.html) that shows both clouds in a browser.
         search: Look among all poses, whatever the rotation and with partial overlap: 'auto' where the network's
@@ -58,7 +58,7 @@ class Register:
         no_refine: Keep the network's own estimate, without search and ICP.
         model: Name of a packaged model (see 'urrt info'), or a file written by 'urrt train'.
         inlier_distance: What counts as touching in fitness and rmse, in the clouds' unit; by default 1.5 times the
-            spacing of the sparser cloud.
+            spacing of the coarser cloud.
         samples: Points to draw on a mesh with faces, from 1 to 10,000,000.
     """
 
@@ -96,7 +96,7 @@ class Register:
     def _run_one(self, source_path: Path, target_path: Path) -> int:
         from urrt_jax import register
         from urrt_jax.cli.compiling import compile_for
-        from urrt_jax.cli.outputs import check_outputs, check_picture
+        from urrt_jax.cli.outputs import check_outputs, check_page, check_picture
         from urrt_jax.cli.printing import as_dict, as_table
         from urrt_jax.cli.streams import as_sentence, note, show
         from urrt_jax.io import check_samples, check_writable, read_cloud, read_point_cloud, read_transform
@@ -108,8 +108,7 @@ class Register:
         check_picture(self.picture, "--picture")
         if self.out is not None:
             check_writable(self.out)
-        if self.view is not None and self.view.suffix.lower() not in (".html", ".htm"):
-            raise ValueError(f"--view: {self.view}: a page is written as .html")
+        check_page(self.view, "--view")
         initial = None if self.initial is None else read_transform(self.initial)
         options = self._options()
         cloud = read_point_cloud(source_path, samples=self.samples)
@@ -216,6 +215,8 @@ class Register:
         from urrt_jax import Search, load_model
         from urrt_jax.refine import ICP
 
+        if self.no_refine and self.search == "always":
+            raise ValueError("--no-refine: keeps the network's own estimate, without a search; leave --search out")
         return {
             "model": load_model(self.model),
             "refine": None if self.no_refine else ICP(),

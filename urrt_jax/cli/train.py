@@ -33,7 +33,7 @@ class NetworkFlags:
         octaves: Widths at which the surroundings of points are described; 0: not at all.
         lookups: Points of each cloud that are looked up in both; 0: none.
         consensus: Rounds in which landmarks that disagree with the others lose weight.
-        hypotheses: Of the pose, the best of which these rounds start from; 0: from none. Not in training.
+        hypotheses: Hypotheses of the pose; the rounds of consensus start from the best one. 0: none. Not in training.
         steps: How often the network is applied, each time to the source as moved so far.
         points: Points of a cloud that the network looks at.
     """
@@ -101,9 +101,9 @@ class Train:
 
     Attributes:
         out: Folder of the run.
-        data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, else
-            'procedural'.
-        limit: At most so many shapes.
+        data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes or clouds; by default $URRT_DATA,
+            else 'procedural'. Each file is a whole shape; a cloud needs at least --pairs.points points.
+        limit: Use at most this many shapes.
         categories: Only shapes of the first so many categories; the others stay unseen.
         queries: Points a shape whose inside and outside teach the regions, where meshes are closed; 0 uses a shell
             around the cloud instead.
@@ -114,11 +114,12 @@ class Train:
         warmup: Steps in which the learning rate rises.
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
-        unrolled: Of the network's steps, so many are trained; the later ones see what the last of these saw.
+        unrolled: How many of the network's steps are run in training, at most --model.steps.
         lookups: Points of each cloud that are looked up in training, at most the model's.
-        rounds: Of consensus among landmarks in training, at most the model's; fresh landmarks have none to find.
+        rounds: Rounds of consensus in training, at most --model.consensus. Landmarks that are not trained yet do not
+            agree, so that few rounds are enough.
         steps_per_call: Steps in one dispatch; more of them help on an accelerator.
-        seed: Of the first weights and of every pair.
+        seed: Random seed of the first weights and of the training pairs.
         every: Steps between validations, each followed by a checkpoint.
         log_every: Steps between lines of metrics.jsonl.
         validation_pairs: Pairs of each kind in a validation.

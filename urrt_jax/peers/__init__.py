@@ -11,8 +11,8 @@ from urrt_jax.peers.correspondences import FGR, RANSAC, KISSMatcher
 from urrt_jax.peers.goicp import GoICP
 from urrt_jax.peers.iterative import GICP, MultiStartICP, Open3DICP, PointToPlaneICP
 from urrt_jax.peers.peer import Peer
-from urrt_jax.peers.polished import OnScans, Polished
 from urrt_jax.peers.simple import Identity, PrincipalAxes
+from urrt_jax.peers.then_icp import OnScans, ThenICP
 
 PEERS: dict[str, Peer] = {
     "identity": Identity(),
@@ -23,9 +23,9 @@ PEERS: dict[str, Peer] = {
     "icp_plane": PointToPlaneICP(),
     "gicp": GICP(),
     "fgr": FGR(),
-    "fgr_icp": Polished(peer=FGR()),
+    "fgr_icp": ThenICP(peer=FGR()),
     "ransac": RANSAC(),
-    "ransac_icp": Polished(peer=RANSAC()),
+    "ransac_icp": ThenICP(peer=RANSAC()),
     "kiss": KISSMatcher(),
     "goicp": GoICP(),
     "scan_icp": OnScans(peer=Open3DICP()),
@@ -36,6 +36,18 @@ PEERS: dict[str, Peer] = {
 """Every peer by its name, with the settings that our tables state."""
 
 __all__ = [
-    "FGR", "GICP", "PEERS", "RANSAC", "GoICP", "Identity", "KISSMatcher", "MultiStartICP", "OnScans", "Open3DICP",
-    "Peer", "PointToPlaneICP", "Polished", "PrincipalAxes",
+    "FGR",
+    "GICP",
+    "PEERS",
+    "RANSAC",
+    "GoICP",
+    "Identity",
+    "KISSMatcher",
+    "MultiStartICP",
+    "OnScans",
+    "Open3DICP",
+    "Peer",
+    "PointToPlaneICP",
+    "PrincipalAxes",
+    "ThenICP",
 ]  # fmt: skip

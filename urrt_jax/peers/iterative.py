@@ -67,7 +67,7 @@ class Open3DICP(Open3DPeer):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MultiStartICP(Open3DPeer):
-    """Point-to-point ICP, Open3D's, from many rotations about the centroids laid on each other; the best is polished.
+    """Point-to-point ICP, Open3D's, from many rotations about the centroids laid on each other; the best is refined.
 
     Among the answers the best is the one with the highest score: the mean of max(0, 1 - d²/r²) over the points of both
     clouds, each cloud counting half, with d the distance to the nearest point of the other cloud. All is deterministic.

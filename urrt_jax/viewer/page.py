@@ -1,4 +1,4 @@
-"""The page: one HTML file with both clouds, on which the source moves from before to after and every side can be seen.
+"""The page: one HTML file that shows both clouds in 3D and moves the source from its first to its registered pose.
 
 Its HTML, CSS and JavaScript are the files in ``web/``, which this module joins to one that needs no network.
 """
@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from urrt_jax.atomic import write_atomically
-from urrt_jax.clouds import CloudLike
-from urrt_jax.result import Registration, rotation_deviation
+from urrt_jax.clouds import CloudLike, as_array
+from urrt_jax.result import UNKNOWN_DEVIATION, Registration, rotation_deviation
 from urrt_jax.viewer.colors import DISTANCES, REGIONS, SOURCE, TARGET
 from urrt_jax.viewer.scene import DrawnCloud, Scene
 
@@ -54,7 +54,7 @@ def save_page(
     """Writes an interactive page about a registration: one HTML file that opens from disk, without a network.
 
     It shows both clouds, moves the source along the rigid motion, colours it by region or by its distance to the
-    target, and tells the diagnostics, the matrix and the other poses that fit.
+    target, and lists the diagnostics, the matrix and the other poses that fit.
 
     Args:
       path: of the file, which is written whole or not at all.
@@ -106,7 +106,7 @@ def _content(source: CloudLike, target: CloudLike, result: Registration, title: 
         "target": _as_content(scene.target),
         "start": scene.start.tolist(),
         "closer": scene.closer,
-        "poses": _poses(scene, np.asarray(target, np.float64), result, inlier_distance),
+        "poses": _poses(scene, np.asarray(as_array(target, "target"), np.float64), result, inlier_distance),
         "diagnostics": {
             "converged": bool(result.converged),
             "reason": result.reason,
@@ -115,7 +115,7 @@ def _content(source: CloudLike, target: CloudLike, result: Registration, title: 
             "inlier_distance": inlier_distance,
             "overlap": [_number(share) for share in np.asarray(result.overlap)],
             "confidence": _number(result.confidence),
-            "deviation": deviation if deviation < 180 else None,  # larger ones, and NaN, say that nothing is known
+            "deviation": deviation if deviation < UNKNOWN_DEVIATION else None,  # or NaN
         },
         "colors": {
             "source": SOURCE,

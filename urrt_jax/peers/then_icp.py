@@ -19,7 +19,7 @@ class _Then(Open3DPeer):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Polished(_Then):
+class ThenICP(_Then):
     """A peer whose answer Open3D's point-to-point ICP starts from.
 
     Attributes:
