@@ -21,7 +21,7 @@ LICENCE = "Apache-2.0. Trained on ModelNet40, whose shapes are for research use 
 LIMITS = {
     "modelnet40": "Whole shapes within 45° about each axis, with noise, crops and outliers: beyond that, a search.",
     "modelnet40-paper": "Clean pairs that hold the same points, turned by 0° to 45° about each axis: for comparison.",
-    "modelnet40-unseen": "As modelnet40, from the first 20 categories and fewer steps: for measuring on the others.",
+    "modelnet40-unseen": "As modelnet40, but from the first 20 categories, in fewer steps: for tests on the other 20.",
 }
 
 

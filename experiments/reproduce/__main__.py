@@ -23,7 +23,7 @@ class Reproduce:
     says how to install it.
 
     Attributes:
-        table: table1, table2, table3, figure4, beyond, unseen, or a folder of your own with a config.toml.
+        table: table1, table2, table3, figure4, beyond, unseen, default, or a folder of your own with a config.toml.
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes; by default $URRT_DATA, or
             'procedural' if that is not set. Tables beyond the paper also look in this folder for bunny_scans.npz and
             for a set with 2,048 points per shape.

@@ -183,7 +183,7 @@ RESULTS = (
     f"{_figure('default_call', 'scans', 'plain', 'recall_2deg_0.02'):.3f} in the later",
     f"{_range('beyond_5', _SIZES)} % are more than 5° wrong",
     f"{_range('beyond_45', [row for row in _SIZES if row['pairs_of'] != '2048 points'])} % are more than 45° wrong",
-    f"at least {100 * min(row['right_asymmetric_called'] for row in _SIZES[3:]):.0f} % of the right poses",
+    f"at least {int(100 * min(row['right_asymmetric_called'] for row in _SIZES[3:]))} % of the right poses",
     f"of solids without any symmetry, {100 * min(row['right_solids_called'] for row in _SIZES[3:]):.0f} %",
     f"{100 * (1 - _SIZES[1]['right_called']):.1f} % of them at 64 points",
     f"of those of solids {100 * (1 - _SIZES[1]['right_solids_called']):.0f} %",

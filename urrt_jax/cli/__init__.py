@@ -26,8 +26,8 @@ urrt register scan.ply model.ply --out moved.ply
 
 urrt register scans/ --to model.ply --out results.csv
 
-Exit codes: 0, the registration converged (of many: all did). 1, it ran and did not converge. 2, wrong use, bad input,
-or a file that could not be written. 130, Ctrl-C.
+Exit codes: 0, done; of register: all pairs converged. 1, register ran, and a pair did not converge. 2, wrong use, bad
+input, or a file that could not be written. 130, Ctrl-C.
 
 Results are on stdout; notes, warnings and progress are on stderr.
 
