@@ -97,7 +97,9 @@ def _use_jax_cache(folder: Path) -> None:
 
 
 def _default_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "urrt_jax" / "programs"
+    asked = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    root = asked if asked.is_absolute() else Path("~/.cache").expanduser()  # as the XDG specification has it
+    return root / "urrt_jax" / "programs"
 
 
 def cached_files() -> tuple[Path, dict[Path, int]]:

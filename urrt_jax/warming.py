@@ -40,7 +40,7 @@ def warm_up(
       ValueError: no sizes, or a size that is not a positive whole number; options as ``register`` refuses them.
     """
     check_options(model, refine, search, None)
-    if not sizes or not all(isinstance(size, int) and size > 0 for size in sizes):
+    if isinstance(sizes, int) or not sizes or not all(isinstance(size, int) and size > 0 for size in sizes):
         raise ValueError(f"sizes: expected positive whole numbers, at least one, got {sizes!r}")
     options = make_options(model, refine, search)
     for size in sorted(set(map(rung, sizes))):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -61,7 +62,7 @@ def test_compiled_programs_are_kept_and_the_second_run_is_silent_about_it(files,
     )
     assert first.returncode == second.returncode in (0, 1)
     assert list((tmp_path / "urrt_jax" / "programs").glob("*.program"))
-    assert not (tmp_path / "urrt_jax" / "jax").exists()
+    assert not (tmp_path / "urrt_jax" / "programs" / "jax").exists()
     assert json.loads(first.stdout) == json.loads(second.stdout)
     assert first.stderr == second.stderr == ""
 
@@ -98,6 +99,18 @@ def test_a_closed_pipe_ends_the_command_silently(arguments):
         process.stdout.close()
         err = process.stderr.read()
     assert err == "" and process.returncode == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
+@pytest.mark.parametrize(
+    ("closed", "out"), [("<&-", True), (">&-", False), ("2>&-", True), (">&- 2>&-", False), ("<&- >&- 2>&-", False)]
+)
+def test_closed_streams_change_neither_the_exit_code_nor_what_is_printed(closed, out):
+    command = f"{shlex.quote(sys.executable)} -m urrt_jax.cli info --json {closed}"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert bool(done.stdout) == out and (not out or json.loads(done.stdout))
 
 
 def test_completion_is_a_script_for_the_shell():

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,35 @@ def test_names_with_commas_quotes_and_umlauts_survive(files, scans, calls):
     assert rows()[0]["source"] == name
     assert folder_run(files) == 0
     assert len(calls) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names are bytes on POSIX alone")
+def test_a_name_that_is_no_utf8_loses_no_row_and_is_known_again(files, scans, calls):
+    os.rename(b"scans/a.ply", b"scans/a\xff.ply")
+    assert folder_run(files) == 0
+    assert Path("results.csv").read_bytes().count(b"\n") == 4
+    assert folder_run(files) == 0
+    assert len(calls) == 1
+
+
+def test_results_that_can_not_be_written_are_found_out_before_any_work(files, scans, calls, capsys, monkeypatch):
+    def fail(path, content):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(many, "write_atomically", fail)
+    assert folder_run(files) == 2
+    assert "results.csv: no space left on device" in capsys.readouterr().err
+    assert not calls
+
+
+def test_names_of_columns_may_be_capitals(files, scans, calls):
+    assert run(files, "--pairs", table("Source, Target\nscans/a.ply,model.ply\n"), "--out", "results.csv") == 0
+
+
+def test_reasons_that_differ_in_a_ratio_are_counted_together():
+    reason = "it did not fit; the source is far larger than the target, scale ratio {}: is one in millimetres?"
+    unsure = [{"m00": "1", "converged": "False", "reason": reason.format(ratio)} for ratio in ("986.1", "1e+03")]
+    assert list(many.summary(unsure)["not_converged"].values()) == [2]
 
 
 @pytest.mark.parametrize(
@@ -268,10 +298,12 @@ def test_two_pairs_of_the_same_files_with_other_initial_transforms_are_two(files
     assert len(calls) == 1
 
 
-def test_a_pair_that_is_named_twice_is_registered_once(files, scans, calls):
+def test_a_pair_that_is_named_twice_is_registered_once(files, scans, calls, capsys):
     pairs = table("source,target\nscans/a.ply,model.ply\nscans/a.ply,model.ply\n")
     assert run(files, "--pairs", pairs, "--out", "results.csv") == 0
     assert len(calls[0]["sources"]) == 1 and len(rows()) == 2
+    assert run(files, "--pairs", pairs, "--out", "results.csv") == 0
+    assert "not run again: 2 pairs of 2" in capsys.readouterr().err
 
 
 def test_a_target_that_repeats_is_read_once(files, scans, calls, monkeypatch):
@@ -299,7 +331,7 @@ def test_small_pairs_run_in_full_batches_of_one_size_and_large_ones_alone(files,
         (["scans", "model.ply"], "'urrt register scans --to model.ply' registers all its files"),
         (["scans/a.ply", "--to", "model.ply"], "scans/a.ply is a file"),
         (["nowhere", "--to", "model.ply"], "nowhere is no folder"),
-        (["scans", "--to", "nowhere.ply"], "--to: nowhere.ply: no such file"),
+        (["scans", "--to", "nowhere.ply"], "--to: nowhere.ply: there is no such file"),
         (["empty", "--to", "model.ply"], "empty: holds no file to register"),
         (["scans", "model.ply", "--to", "model.ply"], "name two files"),
         (["scans"], "name two files"),

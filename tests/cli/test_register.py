@@ -205,9 +205,10 @@ def test_help_names_every_readable_format():
 def test_view_writes_a_page_of_what_was_registered(register, registered, files, tmp_path, monkeypatch):
     pages = []
     registered()
-    monkeypatch.setattr("urrt_jax.viewer.save_page", lambda *arguments: pages.append(arguments))
+    monkeypatch.setattr("urrt_jax.viewer.save_page", lambda *given, title: pages.append((*given, title)))
     register("--view", str(tmp_path / "pair.html"))
-    ((path, source, target, _),) = pages
+    ((path, source, target, _, title),) = pages
+    assert title == "a.ply → b.xyz"
     assert path == tmp_path / "pair.html"
     np.testing.assert_array_equal(source, io.read_cloud(files["a.ply"]))
     np.testing.assert_array_equal(target, io.read_cloud(files["b.xyz"]))

@@ -29,7 +29,7 @@ def test_training_keeps_what_jax_compiles_beside_the_programs(tmp_path, monkeypa
     assert not kept
     cli._keep_compiled_programs(Train(out=tmp_path))
     folder = Path(kept["jax_compilation_cache_dir"])
-    assert folder.is_dir() and folder.parent == tmp_path / "urrt_jax" / "jax"
+    assert folder.is_dir() and folder.parent == tmp_path / "urrt_jax" / "programs" / "jax"
     assert version("jaxlib") in folder.name
 
 

@@ -1,5 +1,6 @@
 """Clouds of other libraries, taken by their attributes."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -76,6 +77,19 @@ def test_a_masked_cloud_of_ours_is_refused_because_not_all_of_its_points_are_rea
 def test_what_is_no_cloud_is_refused_with_the_name_of_the_argument():
     with pytest.raises(ValueError, match=r"target: expected shape \(N, 3\), got \(\)"):
         check_cloud(SimpleNamespace(), None, "target")
+
+
+@pytest.mark.parametrize(
+    ("argument", "says"),
+    [
+        pytest.param("scan.ply", "read_cloud reads files", id="a name"),
+        pytest.param(Path("scan.ply"), "read_cloud reads files", id="a path"),
+        pytest.param(np.ma.masked_array(_POINTS), "masked array", id="a masked array"),
+    ],
+)
+def test_what_only_looks_like_a_cloud_is_refused_with_what_to_do(argument, says):
+    with pytest.raises(ValueError, match=f"source: .*{says}"):
+        as_array(argument, "source")
 
 
 def test_clouds_of_other_libraries_are_padded():

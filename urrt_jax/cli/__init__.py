@@ -14,7 +14,14 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 from urrt_jax.cli.interrupt import end_on_ctrl_c
-from urrt_jax.cli.streams import as_sentence, close_streams, note, replace_unknown_characters, show_warning
+from urrt_jax.cli.streams import (
+    as_sentence,
+    close_streams,
+    note,
+    open_closed_streams,
+    replace_unknown_characters,
+    show_warning,
+)
 
 _DESCRIPTION = """Rigid registration of 3D point clouds: the rotation R and translation t with target = R @ source + t.
 
@@ -46,6 +53,7 @@ URRT_DEBUG     if set, an error shows its traceback"""
 
 def console() -> int:
     """The exit code of the process ``urrt``: ``main`` on a terminal of any encoding, which Ctrl-C ends at once."""
+    open_closed_streams()
     end_on_ctrl_c()
     replace_unknown_characters()
     try:

@@ -91,8 +91,8 @@ def demo_pair(seed: int, *, noise: float, keep: float) -> tuple[np.ndarray, np.n
 
     if not 0 < keep <= 1:
         raise ValueError(f"keep: expected a share in (0, 1], got {keep}")
-    if not noise >= 0 or seed < 0:
-        raise ValueError(f"noise and seed: expected at least 0, got {noise} and {seed}")
+    if not 0 <= noise < np.inf or seed < 0:
+        raise ValueError(f"noise and seed: expected finite numbers of at least 0, got {noise} and {seed}")
     random = np.random.default_rng(seed)
     rotation = Rotation.from_euler("zyx", random.uniform(-45, 45, size=3), degrees=True).as_matrix()
     translation = random.uniform(-0.5, 0.5, size=3)

@@ -20,6 +20,7 @@ import csv
 import functools
 import hashlib
 import io
+import re
 import sys
 import time
 from collections import Counter, deque
@@ -45,6 +46,7 @@ reading, in a batch the pair's share. ``options`` says what the pair was registe
 the sizes and times of its files and of the initial transform: by these a later run knows what need not be done again.
 """
 
+_ANY_NAME = "surrogateescape"  # how names of files that are no UTF-8 are read and written
 _ANY_TEXT = (".csv", ".txt")
 _SMALL = 4096  # points up to which register_pairs works in batches
 _BATCH = 32  # pairs of a batch; register_pairs has the same on a CPU
@@ -81,7 +83,7 @@ def pairs_of_table(table: Path) -> list[Pair]:
     try:
         text = table.read_text(encoding="utf-8-sig")  # spreadsheets begin a file with a mark
         reader = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True)
-        names = [name.strip() for name in reader.fieldnames or ()]
+        names = [name.strip().lower() for name in reader.fieldnames or ()]
         if not {"source", "target"} <= set(names):
             raise ValueError(
                 f"its first line must name columns source and target, separated by a comma; it has {names}"
@@ -104,7 +106,8 @@ def _pair_of_row(folder: Path, row: Mapping[Any, Any], line: int) -> Pair:
     flaw = f"line {line} of the table names no {' and no '.join(missing)}" if missing else ""
     if None in row:
         flaw = f"line {line} of the table has more cells than the first line"
-    return Pair(source, target, (folder / source, folder / target, folder / initial if initial else None), flaw)
+    files = [folder / Path(name).expanduser() if name else None for name in (source, target, initial)]
+    return Pair(source, target, (files[0] or folder, files[1] or folder, files[2]), flaw)
 
 
 def pairs_of_folder(folder: Path, target: Path, initial: Path | None, *, out: Path | None) -> list[Pair]:
@@ -132,7 +135,7 @@ class Results:
     """The rows so far, which a file keeps if one is given.
 
     Attributes:
-      pairs: all that is to be registered.
+      pairs: all that is to be registered; one that is named twice is registered once, and has two rows.
       left: those of them that the file did not hold.
     """
 
@@ -150,7 +153,7 @@ class Results:
         """
         self.pairs, self._options, self._path = pairs, options, path
         self._echo = echo and path is None
-        self._keys = {pair: (pair.source, pair.target, _digest(pair)) for pair in pairs}
+        self._keys = {pair: (pair.source, pair.target, _digest(pair)) for pair in self.pairs}
         self._rows: dict[tuple[str, str, str], dict[str, str]] = {}
         self._others: list[dict[str, str]] = []
         if path is not None and path.exists():
@@ -159,7 +162,7 @@ class Results:
         self._saved = time.monotonic()
 
     def _take_up(self, path: Path) -> None:
-        wanted, changed = set(self._keys.values()), 0
+        wanted, changed = set(self._keys.values()), set()
         named = {key[:2] for key in wanted}
         for row in _read_results(path):
             key = row["source"], row["target"], row["inputs"]
@@ -173,10 +176,11 @@ class Results:
             elif key in wanted:
                 self._rows[key] = row
             else:
-                changed += 1
-        note(f"already in {path}, not run again: {_pairs(len(self._rows))} of {len(wanted)}")
+                changed.add(key[:2])
+        done = sum(self._keys[pair] in self._rows for pair in self.pairs)
+        note(f"already in {path}, not run again: {_pairs(done)} of {len(self.pairs)}")
         if changed:
-            note(f"files or initial transform have changed since, run again: {_pairs(changed)}")
+            note(f"files or initial transform have changed since, run again: {_pairs(len(changed))}")
         if self._others:
             note(f"in {path} but not asked for now, kept below the others: {_pairs(len(self._others))}")
 
@@ -193,7 +197,8 @@ class Results:
     def save(self) -> None:
         """Writes the file, whole or not at all."""
         if self._path is not None:
-            write_atomically(self._path, ",".join(COLUMNS) + "\n" + _as_csv([*self.rows(), *self._others]))
+            text = ",".join(COLUMNS) + "\n" + _as_csv([*self.rows(), *self._others])
+            write_atomically(self._path, text.encode("utf-8", _ANY_NAME))
             self._saved = time.monotonic()
 
     def rows(self) -> list[dict[str, str]]:
@@ -226,7 +231,7 @@ def _state(path: Path) -> tuple[int, int] | None:
 
 def _read_results(path: Path) -> list[dict[str, str]]:
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8", errors=_ANY_NAME, newline="") as file:
             reader = csv.DictReader(file, strict=True)
             if tuple(reader.fieldnames or ()) != COLUMNS:
                 raise ValueError("its first line is another one")
@@ -282,6 +287,7 @@ def register_many(results: Results, *, samples: int, options: Mapping[str, Any])
       samples: points to draw on a mesh.
       options: as ``register_pairs`` takes them.
     """
+    results.save()  # a file that can't be written is found out before any work
     waiting: dict[int, list[_Loaded]] = {}
     total, left = len(results.pairs), len(results.left)
     with (
@@ -364,8 +370,8 @@ def summary(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
     """How many pairs converged, how many did not for which reason, and which could not be registered."""
     failed = [row for row in rows if row["m00"] == "nan"]
     unsure = [row for row in rows if row["m00"] != "nan" and row["converged"] != "True"]
-    # What follows a colon is about the one pair.
-    reasons = Counter(row["reason"].partition(": ")[0] for row in unsure)
+    # What follows a colon is about the one pair, and so is a ratio of scales.
+    reasons = Counter(re.sub(r"scale ratio [\d.e+]+: ", "", row["reason"]).partition(": ")[0] for row in unsure)
     return {
         "pairs": len(rows),
         "converged": len(rows) - len(failed) - len(unsure),

@@ -87,6 +87,8 @@ class Register:
                 "name two files (urrt register A B), a folder and its target (urrt register FOLDER --to B), "
                 "or a table of pairs (urrt register --pairs PAIRS.csv)"
             )
+        if self.target.is_dir():
+            raise ValueError(f"{self.target} is a folder, a file was expected")
         if self.source.is_dir():
             raise ValueError(
                 f"{self.source} is a folder; 'urrt register {self.source} --to {self.target}' registers all its files"
@@ -142,6 +144,8 @@ class Register:
         from urrt_jax.io import holds_colors, holds_normals, write_cloud
         from urrt_jax.viewer import region_colors, save_page
 
+        title = None if self.source is None or self.target is None else f"{self.source.name} → {self.target.name}"
+
         def write_moved(path: Path) -> None:
             moved, more = result.apply(cloud.points), {}
             if holds_colors(path) and cloud.colors is not None:
@@ -155,7 +159,7 @@ class Register:
         writers = {
             self.out: write_moved,
             self.picture: lambda path: write_picture(path, cloud.points, target, result),
-            self.view: lambda path: save_page(path, cloud.points, target, result),
+            self.view: lambda path: save_page(path, cloud.points, target, result, title=title),
         }
         return [(path, write) for path, write in writers.items() if path is not None]
 
@@ -187,7 +191,8 @@ class Register:
             what = "is a file" if self.source.exists() else "is no folder, there is nothing of this name"
             raise ValueError(f"{self.source} {what}; --to takes a folder, 'urrt register A B' two files")
         if self.to is not None and not self.to.is_file():
-            raise ValueError(f"--to: {self.to}: no such file")
+            what = "is a folder, a file was expected" if self.to.is_dir() else "there is no such file"
+            raise ValueError(f"--to: {self.to}: {what}")
         if self.initial is not None:
             check_rigid(read_transform(self.initial))
         check_outputs({"--out": self.out}, (self.pairs, self.to, self.initial))

@@ -30,6 +30,20 @@ def show_warning(message: Warning | str, *_: Any) -> None:
     note(f"warning: {' '.join(str(message).split())}")
 
 
+def open_closed_streams() -> None:
+    """Gives the process a standard input, output and error that lead nowhere, where its caller has closed them.
+
+    Otherwise the next file to be opened would take the place of one of them, and get what is printed.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the smallest number that is free
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+
+
 def replace_unknown_characters() -> None:
     """From now on stdout and stderr show characters that their encoding lacks in a readable way, as " deg" for "°"."""
     codecs.register_error("readable", _replace)

@@ -1,5 +1,6 @@
 """What is refused of a user's cloud, in words that name the argument."""
 
+import os
 from typing import Any, Protocol
 
 import jax
@@ -88,10 +89,14 @@ def as_array(points: CloudLike, name: str) -> Array | np.ndarray:
       name: how the caller calls this argument.
 
     Raises:
-      ValueError: rows of different lengths.
+      ValueError: rows of different lengths, a masked array, or a file name.
     """
+    if isinstance(points, np.ma.MaskedArray):
+        raise ValueError(f"{name}: got a masked array; pass its data, and which rows are real as a mask")
     if isinstance(points, jax.Array | np.ndarray):
         return points
+    if isinstance(points, str | os.PathLike):
+        raise ValueError(f"{name}: expected an (N, 3) array, got a file name; urrt_jax.io.read_cloud reads files")
     held: Any = points
     if hasattr(held, "point"):
         held = held.point.positions.numpy()

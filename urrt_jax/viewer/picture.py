@@ -52,7 +52,7 @@ def plot_registration(
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError("pictures need Matplotlib: pip install 'urrt-jax[viz]'") from error
+        raise ImportError(f"pictures need Matplotlib: pip install 'urrt-jax[viz]' ({error})") from error
 
     scene = Scene.of(source, target, result, points=_POINTS)
     rotation = np.asarray(result.rotation, np.float64)
