@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from urrt_jax import Model, ModelConfig
 from urrt_jax.model import init_model
+from urrt_jax.result import OtherPoses, Outcome, Registration
+from urrt_jax.rigid import Rigid
 
 # The first example of a test compiles; deadlines would measure the compiler.
 settings.register_profile("urrt", deadline=None, max_examples=25, derandomize=True, database=None)
@@ -138,3 +141,46 @@ def x64():
     """Double precision within one test, for sharp finite differences."""
     with jax.enable_x64(True):
         yield jnp.float64
+
+
+def _made_up_registration(
+    source: np.ndarray,
+    target: np.ndarray,
+    *,
+    matrix: np.ndarray | None = None,
+    others: tuple[tuple[np.ndarray, float], ...] = (),
+    converged: bool = True,
+) -> Registration:
+    """A result with this pose, the identity by default, these others, and regions by octant."""
+    octants = [((cloud > cloud.mean(axis=0)) @ [1, 2, 4]).astype(np.int32) for cloud in (source, target)]
+    matrix = np.eye(4) if matrix is None else matrix
+    others = others or ((np.eye(4), 0.0),)
+    return Registration(
+        rotation=matrix[:3, :3],
+        translation=matrix[:3, 3],
+        fitness=jnp.array(0.75),
+        rmse=jnp.array(0.0125),
+        inlier_distance=jnp.array(0.05),
+        overlap=jnp.array([0.75, 0.8]),
+        confidence=jnp.array(0.9),
+        converged=jnp.array(converged),
+        outcome=jnp.array(Outcome.CONVERGED if converged else Outcome.MISFIT, jnp.int32),
+        correspondences=jnp.zeros(len(source), jnp.int32),
+        information=jnp.eye(6),
+        covariance=1e-6 * jnp.eye(6),
+        alternatives=OtherPoses(
+            np.stack([other[:3, :3] for other, _ in others]),
+            np.stack([other[:3, 3] for other, _ in others]),
+            np.array([weight for _, weight in others]),
+        ),
+        source_regions=jnp.asarray(octants[0]),
+        target_regions=jnp.asarray(octants[1]),
+        coarse=Rigid(jnp.eye(3), jnp.zeros(3)),
+        steps=jnp.array(3),
+    )
+
+
+@pytest.fixture(scope="session")
+def registration() -> Callable[..., Registration]:
+    """A function of (source, target) and a matrix: a made-up result, for tests that need no registration."""
+    return _made_up_registration

@@ -249,7 +249,7 @@ def test_the_first_call_asks_for_common_stages_before_it_runs_any(pairs, small_m
     assert seen == [jax.ShapeDtypeStruct, np.ndarray, np.ndarray]
 
 
-@pytest.mark.parametrize("sizes", [(), (0,), (1.5,), ("many",)], ids=str)
+@pytest.mark.parametrize("sizes", [(), (0,), (1.5,), ("many",), 800], ids=str)
 def test_warm_up_refuses_what_is_no_size(sizes):
     with pytest.raises(ValueError, match="sizes"):
         warm_up(sizes)

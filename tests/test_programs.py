@@ -415,6 +415,13 @@ print(json.dumps([events, type(result).__name__, np.asarray(result.singular).tol
         monkeypatch.delenv("URRT_NO_CACHE", raising=False)
         assert use_compilation_cache() == tmp_path / "urrt_jax" / "programs"
 
+    def test_a_relative_folder_of_the_environment_is_ignored(self, tmp_path, monkeypatch):
+        monkeypatch.setenv("XDG_CACHE_HOME", "here")
+        monkeypatch.setenv("HOME", str(tmp_path))
+        monkeypatch.delenv("URRT_NO_CACHE", raising=False)
+        monkeypatch.chdir(tmp_path)
+        assert use_compilation_cache() == tmp_path / ".cache" / "urrt_jax" / "programs"
+
     def test_the_environment_can_forbid_the_default_folder(self, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         monkeypatch.setenv("URRT_NO_CACHE", "1")

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -526,6 +527,10 @@ def test_matrix_transform_and_apply_agree(plain, cloud, target):
     homogeneous = np.concatenate([cloud, np.ones((200, 1), np.float32)], 1) @ np.asarray(plain.matrix).T
     np.testing.assert_allclose(homogeneous[:, :3], plain.apply(cloud), atol=1e-5)
     np.testing.assert_allclose(plain.transform.apply(jnp.asarray(cloud)), plain.apply(cloud), atol=1e-5)
+
+
+def test_clouds_of_other_libraries_are_moved_by_their_points(plain, cloud):
+    np.testing.assert_array_equal(plain.apply(trimesh.PointCloud(cloud)), plain.apply(np.asarray(cloud, np.float64)))
 
 
 def test_correspondences_are_the_nearest_points_within_the_inlier_distance(call_padded, cloud, target):

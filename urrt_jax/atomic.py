@@ -36,6 +36,22 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> None
         _unfinished.discard(unfinished)
 
 
+def check_place(path: str | os.PathLike[str]) -> None:
+    """Raises a ``ValueError`` that says why, where ``write_atomically`` should not or could not write this file.
+
+    The folder is missing or can't be written to, or the name is that of a folder, a pipe or a device, which must not be
+    replaced by a file.
+    """
+    path = Path(path)
+    folder = Path(os.path.realpath(path)).parent  # where a link points to is where it is written
+    if not folder.is_dir():
+        raise ValueError(f"{path}: there is no folder {folder} to write to")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{path}: the folder {folder} is not writable")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: exists and is not a regular file, so it is not replaced")
+
+
 def remove_unfinished() -> None:
     """Removes what calls in other threads have begun to write, for a process that is about to end."""
     for path in tuple(_unfinished):

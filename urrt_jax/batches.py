@@ -22,7 +22,9 @@ from urrt_jax.rigid import Rigid
 from urrt_jax.search import Search
 from urrt_jax.stages import Options, register_in_frame, rung
 
-_LARGEST = 4096  # the largest rung whose pairs run in batches: larger ones keep all cores busy by themselves
+LARGEST_IN_BATCHES = 4096
+"""The most points of clouds that are registered in batches: larger ones keep all cores busy by themselves."""
+
 _FEW = 2  # pairs of a rung that are not worth a program of their own
 _BATCH_ON_CPU = 32  # twice as many leave the caches of a CPU, and take an eighth longer each
 _BATCH = 64  # on an accelerator; a guess, for which two matrices of 4,096² distances a pair fit into 16 GiB
@@ -165,7 +167,7 @@ def register_pairs(
         raise ValueError(f"sources, targets and initials: expected lists of one length, at least 1, got {lengths}")
     check_options(model, refine, search, inlier_distance)
     if batch is None:
-        batch = _BATCH_ON_CPU if jax.default_backend() == "cpu" else _BATCH
+        batch = pairs_at_once()
     check_whole(_Asked(batch), batch=1)
     options = make_options(model, refine, search)
 
@@ -196,7 +198,7 @@ def register_pairs(
                 bar.update()
                 continue
             key = size, _ = rung(pair.size), pair.dtype
-            if size > _LARGEST or batch == 1:
+            if size > LARGEST_IN_BATCHES or batch == 1:
                 run({index: pair}, size, together=False)
                 continue
             group = waiting.setdefault(key, {})
@@ -211,6 +213,11 @@ def register_pairs(
     sizes = np.array([[len(each.source_regions), len(each.target_regions)] for each in ordered])
     said = [reasons.get(index) or str(each.reason) for index, each in enumerate(ordered)]
     return Registrations(_stack(ordered), said, sizes)
+
+
+def pairs_at_once() -> int:
+    """How many pairs a batch has by default, on the device in use."""
+    return _BATCH_ON_CPU if jax.default_backend() == "cpu" else _BATCH
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What the tests of the command line share: two small files, a small model, and a call of the command."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import pytest
 import urrt_jax
 from urrt_jax import cli, io
 from urrt_jax.data import demo_shape
-from urrt_jax.rigid import Rigid
 
 
 @pytest.fixture(autouse=True)
@@ -33,30 +33,12 @@ def files(tmp_path_factory, small_model) -> dict[str, Path]:
 
 
 @pytest.fixture
-def answer() -> urrt_jax.Registration:
-    """A made-up result for two clouds of 200 points, for tests that need no registration."""
-    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
-    others = np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)), np.zeros(4)
-    fields: dict = dict(
-        rotation=turn,
-        translation=np.array([0.1, 1 / 3, 0.3]),
-        fitness=np.array(0.9),
-        rmse=np.array(0.012345678),
-        inlier_distance=np.array(0.05),
-        overlap=np.array([0.9, 0.8]),
-        confidence=np.array(0.95),
-        converged=np.array(True),
-        outcome=np.array(0),
-        correspondences=np.zeros(200, np.int32),
-        information=np.eye(6),
-        covariance=np.eye(6) * 1e-6,
-        alternatives=urrt_jax.OtherPoses(*others),
-        source_regions=np.zeros(200, np.int32),
-        target_regions=np.zeros(200, np.int32),
-        coarse=Rigid(turn, np.zeros(3)),
-        steps=np.array(3),
-    )
-    return urrt_jax.Registration(**fields)
+def answer(registration) -> urrt_jax.Registration:
+    """A made-up result for two clouds of 200 points, with numbers of many digits."""
+    matrix = np.eye(4)
+    matrix[:3] = [[0.8, -0.6, 0.0, 0.1], [0.6, 0.8, 0.0, 1 / 3], [0.0, 0.0, 1.0, 0.3]]
+    cloud = np.zeros((200, 3))
+    return dataclasses.replace(registration(cloud, cloud, matrix=matrix), rmse=np.array(0.012345678))
 
 
 @pytest.fixture(scope="module")

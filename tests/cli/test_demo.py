@@ -43,7 +43,7 @@ def test_demo_pair_keeps_the_share_asked_for():
     assert len(demo_pair(0, noise=0.0, keep=0.5)[0]) == pytest.approx(1024, abs=2)
 
 
-@pytest.mark.parametrize("flags", [{"keep": 0.0}, {"keep": 1.1}, {"noise": -1.0}], ids=str)
+@pytest.mark.parametrize("flags", [{"keep": 0.0}, {"keep": 1.1}, {"noise": -1.0}, {"noise": np.inf}], ids=str)
 def test_demo_pair_refuses_nonsense(flags):
     with pytest.raises(ValueError, match="expected"):
         demo_pair(0, **({"noise": 0.0, "keep": 1.0} | flags))

@@ -150,6 +150,26 @@ def test_names_of_columns_may_be_capitals(files, scans, calls):
     assert run(files, "--pairs", table("Source, Target\nscans/a.ply,model.ply\n"), "--out", "results.csv") == 0
 
 
+def test_a_file_that_takes_long_to_write_is_written_seldom(files, scans, calls, monkeypatch):
+    """A second each, of 200 pairs that take a second each: at most a twentieth of the time goes into saving."""
+    now, writes = [0.0], []
+
+    def write(path, content):
+        now[0] += 1.0
+        writes.append(now[0])
+
+    monkeypatch.setattr(many, "write_atomically", write)
+    monkeypatch.setattr(many.time, "monotonic", lambda: now[0])
+    pairs = [many.Pair(f"{number}", "target", (Path(f"{number}"), Path("target"), None)) for number in range(200)]
+    results = many.Results(pairs, "", Path("results.csv"), echo=False)
+    results.save()
+    for pair in pairs:
+        now[0] += 1.0
+        results.add(pair, dict.fromkeys(many.COLUMNS, ""))
+        results.save_if_due()
+    assert 8 <= len(writes) <= 11
+
+
 def test_reasons_that_differ_in_a_ratio_are_counted_together():
     reason = "it did not fit; the source is far larger than the target, scale ratio {}: is one in millimetres?"
     unsure = [{"m00": "1", "converged": "False", "reason": reason.format(ratio)} for ratio in ("986.1", "1e+03")]
@@ -229,7 +249,7 @@ class TestAnotherRun:
         assert "already in results.csv, not run again: 3 pairs of 3\n" in capsys.readouterr().err
 
     def test_goes_on_where_the_first_was_stopped(self, files, scans, calls, monkeypatch):
-        monkeypatch.setattr(many, "_BATCH", 1)
+        monkeypatch.setattr(many, "pairs_at_once", lambda: 1)
         stub = many.register_pairs
 
         def interrupt_second(*arguments, **options):
@@ -314,7 +334,7 @@ def test_a_target_that_repeats_is_read_once(files, scans, calls, monkeypatch):
 
 
 def test_small_pairs_run_in_full_batches_of_one_size_and_large_ones_alone(files, scans, calls, monkeypatch):
-    monkeypatch.setattr(many, "_BATCH", 2)
+    monkeypatch.setattr(many, "pairs_at_once", lambda: 2)
     sizes = {"a": 100, "b": 5000, "c": 100, "d": 300, "e": 100, "f": 300}
     for path in Path("scans").iterdir():
         path.unlink()

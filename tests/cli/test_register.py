@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -239,15 +240,32 @@ def test_no_file_of_the_command_is_overwritten_by_it(register, files, capsys, tm
 
 @pytest.mark.parametrize(
     "flags",
-    [["--out", "moved.abc"], ["--picture", "pair.abc"], ["--view", "pair.abc"], ["--out", "folder.ply"]],
+    [
+        ["--out", "moved.abc"],
+        ["--picture", "pair.abc"],
+        ["--view", "pair.abc"],
+        ["--out", "folder.ply"],
+        ["--view", "pipe.html"],
+    ],
     ids=" ".join,
 )
 def test_a_file_of_no_known_kind_is_refused_before_any_work(register, capsys, tmp_path, monkeypatch, flags):
     (tmp_path / "folder.ply").mkdir()
+    os.mkfifo(tmp_path / "pipe.html")
     monkeypatch.chdir(tmp_path)
     never_read(monkeypatch)
     assert register(*flags) == 2
     assert flags[1] in capsys.readouterr().err
+
+
+def test_a_search_without_refinement_is_refused_not_dropped(register, capsys):
+    assert register("--no-refine", "--search", "always") == 2
+    assert "--no-refine: keeps the network's own estimate" in capsys.readouterr().err
+
+
+def test_a_folder_in_the_place_of_the_target_is_called_one(register, capsys, tmp_path):
+    assert register(target=tmp_path) == 2
+    assert f"{tmp_path} is a folder, a file was expected" in capsys.readouterr().err
 
 
 def test_a_picture_without_matplotlib_is_refused_before_any_work(register, capsys, tmp_path, monkeypatch):

@@ -6,10 +6,12 @@ import html
 import json
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import KDTree
 
 from urrt_jax.result import Outcome
@@ -33,6 +35,12 @@ def content(page: str) -> dict:
         if "distances" in pose:
             pose["distances"] = np.frombuffer(base64.b64decode(pose["distances"]), np.uint8)
     return given
+
+
+def test_clouds_of_other_libraries_make_the_page_of_their_points(pair, registration):
+    result = registration(*pair)
+    objects = [SimpleNamespace(points=pair[0]), trimesh.PointCloud(pair[1])]
+    assert show_registration(*objects, result).html == show_registration(*pair, result).html
 
 
 class Elements(HTMLParser):

@@ -32,8 +32,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from urrt_jax import register_pairs
 from urrt_jax.atomic import write_atomically
+from urrt_jax.batches import LARGEST_IN_BATCHES, pairs_at_once, register_pairs
 from urrt_jax.cli.streams import as_sentence, note
 from urrt_jax.io import READABLE, read_cloud, read_transform
 from urrt_jax.stages import rung
@@ -48,11 +48,9 @@ the sizes and times of its files and of the initial transform: by these a later 
 
 _ANY_NAME = "surrogateescape"  # how names of files that are no UTF-8 are read and written
 _ANY_TEXT = (".csv", ".txt")
-_SMALL = 4096  # points up to which register_pairs works in batches
-_BATCH = 32  # pairs of a batch; register_pairs has the same on a CPU
 _AHEAD = 4  # pairs that are read while others are registered; more large clouds would only take memory
 _KEPT = 4  # clouds that stay in memory, because the next pairs may share them
-_SAVED_EVERY = 30.0  # seconds, while pairs fail without being registered
+_PATIENCE = 20.0  # a file of many rows takes long to write: saving takes at most one part in so many of the time
 
 
 class Pair(NamedTuple):
@@ -159,7 +157,7 @@ class Results:
         if path is not None and path.exists():
             self._take_up(path)
         self.left = [pair for pair, key in self._keys.items() if key not in self._rows]
-        self._saved = time.monotonic()
+        self._saved, self._took = time.monotonic(), 0.0
 
     def _take_up(self, path: Path) -> None:
         wanted, changed = set(self._keys.values()), set()
@@ -191,15 +189,20 @@ class Results:
         self._rows[key] = row
         if self._echo:
             print(_as_csv([row]), end="", flush=True)  # where nobody reads on, the command ends
-        if time.monotonic() - self._saved > _SAVED_EVERY:
+
+    def save_if_due(self) -> None:
+        """Writes the file, unless it was written so lately that writing would take much of the time."""
+        if time.monotonic() - self._saved > _PATIENCE * self._took:
             self.save()
 
     def save(self) -> None:
         """Writes the file, whole or not at all."""
         if self._path is not None:
+            start = time.monotonic()
             text = ",".join(COLUMNS) + "\n" + _as_csv([*self.rows(), *self._others])
             write_atomically(self._path, text.encode("utf-8", _ANY_NAME))
             self._saved = time.monotonic()
+            self._took = self._saved - start
 
     def rows(self) -> list[dict[str, str]]:
         """The rows of the pairs so far, in their order."""
@@ -288,47 +291,49 @@ def register_many(results: Results, *, samples: int, options: Mapping[str, Any])
       options: as ``register_pairs`` takes them.
     """
     results.save()  # a file that can't be written is found out before any work
+    total, left, at_once = len(results.pairs), len(results.left), pairs_at_once()
     waiting: dict[int, list[_Loaded]] = {}
-    total, left = len(results.pairs), len(results.left)
-    with (
-        ThreadPoolExecutor(2, thread_name_prefix="urrt reading") as readers,
-        tqdm(total=total, initial=total - left, desc="registering", unit="pair", file=sys.stderr, disable=None) as bar,
-    ):
+    bar = tqdm(total=total, initial=total - left, desc="registering", unit="pair", file=sys.stderr, disable=None)
 
-        def run(chunk: list[_Loaded]) -> None:
-            for (pair, *_), row in zip(chunk, _register_chunk(chunk, options), strict=True):
-                results.add(pair, row)
-            results.save()
-            bar.update(len(chunk))
+    def add(*rows: tuple[Pair, dict[str, str]]) -> None:
+        for pair, row in rows:
+            results.add(pair, row)
+        results.save_if_due()
+        bar.update(len(rows))
 
-        for pair, loaded in _read(results.left, readers, samples):
-            if isinstance(loaded, str):
-                results.add(pair, _failed(loaded))
-                bar.update()
-                continue
-            size = max(len(loaded.source), len(loaded.target))
-            if size > _SMALL:
-                run([loaded])
-                continue
-            group = waiting.setdefault(rung(size), [])
-            group.append(loaded)
-            if len(group) == _BATCH:
-                run(waiting.pop(rung(size)))
-        for group in waiting.values():
-            run(group)
-    results.save()
+    def run(chunk: list[_Loaded]) -> None:
+        add(*zip((loaded.pair for loaded in chunk), _register_chunk(chunk, at_once, options), strict=True))
+
+    try:
+        with bar, ThreadPoolExecutor(2, thread_name_prefix="urrt reading") as readers:
+            for pair, loaded in _read(results.left, readers, samples):
+                if isinstance(loaded, str):
+                    add((pair, _failed(loaded)))
+                    continue
+                size = rung(max(len(loaded.source), len(loaded.target)))
+                if size > LARGEST_IN_BATCHES:
+                    run([loaded])
+                    continue
+                group = waiting.setdefault(size, [])
+                group.append(loaded)
+                if len(group) == at_once:
+                    run(waiting.pop(size))
+            for group in waiting.values():
+                run(group)
+    finally:
+        results.save()
 
 
-def _register_chunk(chunk: list[_Loaded], options: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The rows of these pairs."""
+def _register_chunk(chunk: list[_Loaded], batch: int, options: Mapping[str, Any]) -> list[dict[str, str]]:
+    """The rows of these pairs, of which so many make a batch."""
     _, sources, targets, initials = zip(*chunk, strict=True)
     start = time.perf_counter()
     try:
-        found = register_pairs(sources, targets, initials=initials, batch=_BATCH, **options)
+        found = register_pairs(sources, targets, initials=initials, batch=batch, **options)
     except Exception as error:  # memory runs out, say: the others may still be registered
         if len(chunk) == 1:
             return [_failed(as_sentence(error))]
-        return [row for each in chunk for row in _register_chunk([each], options)]
+        return [row for each in chunk for row in _register_chunk([each], batch, options)]
     seconds = (time.perf_counter() - start) / len(chunk)
     return [_row(result, reason, seconds) for result, reason in zip(found, found.reasons, strict=True)]
 

@@ -1,8 +1,9 @@
 """Files that a command is told to write: what is wrong with their names is said before any work."""
 
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+
+from urrt_jax.atomic import check_place
 
 PICTURES = (".png", ".pdf", ".svg")
 
@@ -15,18 +16,16 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path | No
       inputs: files that the command reads; None where there is none.
 
     Raises:
-      ValueError: a folder is missing or can't be written to, a name is that of a folder, or two names are one file.
+      ValueError: a file can't be written there (``check_place``), or two names are one file.
     """
     taken = {_identity(path): f"{path} is read" for path in inputs if path is not None}
     for flag, path in outputs.items():
         if path is None:
             continue
-        if not path.parent.is_dir():
-            raise ValueError(f"{flag}: {path}: there is no folder {path.parent} to write to")
-        if path.is_dir():
-            raise ValueError(f"{flag}: {path} is a folder, a file was expected")
-        if not os.access(path.parent, os.W_OK):
-            raise ValueError(f"{flag}: {path}: the folder {path.parent} can't be written to")
+        try:
+            check_place(path)
+        except ValueError as error:
+            raise ValueError(f"{flag}: {error}") from error
         if (use := taken.get(_identity(path))) is not None:
             raise ValueError(f"{flag}: {use} by this command too; choose another name")
         taken[_identity(path)] = f"{path} is written by {flag}"

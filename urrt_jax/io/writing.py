@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from urrt_jax.atomic import write_atomically
+from urrt_jax.atomic import check_place, write_atomically
 from urrt_jax.io.cloud import PointCloud, as_points
 from urrt_jax.io.files import BadFile
 from urrt_jax.io.formats import WRITABLE, WRITERS, extension_of, holds_colors, holds_normals, require_libraries
@@ -63,13 +63,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         require_libraries(path)
     except ImportError as error:
         raise ValueError(str(error)) from error
-    folder = Path(os.path.realpath(path)).parent  # where a link points to is where it is written
-    if not folder.is_dir():
-        raise ValueError(f"{path}: there is no folder {folder} to write to")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"{path}: the folder {folder} is not writable")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: exists and is not a regular file, so it is not replaced")
+    check_place(path)
 
 
 def _check_extension(path: Path) -> None:
