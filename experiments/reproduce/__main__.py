@@ -29,8 +29,9 @@ class Reproduce:
             for a set with 2,048 points per shape.
         out: Folder to write to; by default reproduced/TABLE.
         limit: Measure at most this many pairs of each protocol, evenly spread over the data.
-        only: Measure only these methods, by their names in the config.toml. The rows of the other methods are copied
-            from the results in --out, which must be of the same data, pairs and settings.
+        only: Measure these methods anew, by their names in the config.toml. The rows of the other methods are copied
+            from the results in --out, which must be of the same data, pairs and settings; rows that are not there are
+            measured.
         model: Our network: the name of a packaged model, or a file written by 'urrt train'.
     """
 

@@ -47,6 +47,7 @@ class Part(_Table):
         a table of numbers by column.
       columns: the columns of this part, if they differ from the experiment's.
       stride: measure one item in this many, where all would take too long; the table states it.
+      first: measure at most this many of those items, the first ones; None for all.
       note: text under the title.
     """
 
@@ -59,6 +60,7 @@ class Part(_Table):
     columns: tuple[str, ...] | None = None
     published: dict[str, Any] = dataclasses.field(default_factory=dict)
     stride: int = 1
+    first: int | None = None
     note: str = ""
 
 
@@ -101,10 +103,10 @@ class Experiment(_Table):
       columns: columns of the tables, by their names in `Evaluation.summary`. The prefix "asymmetric." leaves out the
         axisymmetric categories.
       published_columns: the columns of the lists in `Part.published`.
-      not_built: titles of learned methods that are not built here; each gets an empty row.
       parts: protocols, one table each.
       sweeps: protocols at several values of one option, one panel of a figure each.
       trends: whether to draw the errors against rotation angle and overlap.
+      matrix: whether to draw a figure of all methods against all parts.
       note: text under the title.
     """
 
@@ -114,10 +116,10 @@ class Experiment(_Table):
     methods: tuple[str, ...]
     columns: tuple[str, ...] = ()
     published_columns: tuple[str, ...] = ()
-    not_built: tuple[str, ...] = ()
     parts: tuple[Part, ...]
     sweeps: tuple[Sweep, ...] = ()
     trends: bool = False
+    matrix: bool = False
     note: str = ""
 
 
@@ -160,6 +162,9 @@ def _check(experiment: Experiment) -> None:
     for each in (*experiment.parts, *experiment.sweeps):
         if each.stride < 1 or each.points < 1:
             raise ValueError(f"stride and points: expected at least 1, got {each.stride} and {each.points}")
+    for part in experiment.parts:
+        if part.first is not None and part.first < 1:
+            raise ValueError(f"first: expected at least 1, got {part.first}")
     for name in {
         *experiment.methods,
         *(name for each in (*experiment.parts, *experiment.sweeps) for name in each.methods or ()),

@@ -79,6 +79,36 @@ def draw_sweeps(results: dict[str, Any], path: Path) -> None:
     _finish(figure, panels, "", "share within 5° and 0.1", path)
 
 
+def draw_matrix(results: dict[str, Any], path: Path) -> None:
+    """Draws a row a method and a column a part: the share of pairs within 5° and 0.1, as colour and number."""
+    parts = [part for part in results["parts"] if _measured(part)]
+    if not parts:
+        return
+    titles = {row["method"]: row["title"] for part in parts for row in _measured(part)}
+    figure, (axes,) = _panels(1)
+    figure.set_size_inches(2.6 + 0.62 * len(parts) + 0.9, 1.5 + 0.24 * len(titles))
+    for across, part in enumerate(parts):
+        for row in _measured(part):
+            share, down = row["recall_5deg_0.1"], list(titles).index(row["method"])
+            axes.fill_between([across - 0.5, across + 0.5], down - 0.5, down + 0.5, color=_shade(share), linewidth=0)
+            ink = "white" if share > 0.6 else _INK
+            axes.text(across, down, f"{share:.2f}", ha="center", va="center", fontsize=7, color=ink)
+    axes.set(xlim=(-0.5, len(parts) - 0.5), ylim=(len(titles) - 0.5, -0.5))
+    axes.set_xticks(range(len(parts)), [part["title"] for part in parts], rotation=40, ha="left", fontsize=7.5)
+    axes.set_yticks(range(len(titles)), list(titles.values()), fontsize=7.5)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0, colors=_INK)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    figure.savefig(path)
+
+
+def _shade(share: float) -> tuple[float, float, float]:
+    """From nearly white, where no pair is right, to a dark blue, where all are."""
+    low, high = (0.95, 0.965, 0.98), (0.11, 0.31, 0.55)
+    return tuple(a + share * (b - a) for a, b in zip(low, high, strict=True))  # type: ignore[return-value]
+
+
 def _varies(part: dict[str, Any], name: str) -> bool:
     """Whether the pairs of a part fall into more than one bin."""
     return any(sum(value is not None for value in row.get("trends", {}).get(name, [])) > 1 for row in part["rows"])

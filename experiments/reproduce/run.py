@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from experiments.reproduce.experiment import Experiment, Part, Sweep, results_header
-from experiments.reproduce.figures import check_drawing, draw_recalls, draw_sweeps, draw_trends
+from experiments.reproduce.figures import check_drawing, draw_matrix, draw_recalls, draw_sweeps, draw_trends
 from experiments.reproduce.tables import as_markdown
 from urrt_jax.atomic import write_atomically
 from urrt_jax.data import load_shapes
@@ -69,15 +69,15 @@ def reproduce(
       out: the folder to write to.
       model: our network: the name of a packaged model, or a file.
       limit: at most this many items per part, evenly spread over the data; all by default.
-      only: names of the methods to measure; all by default. The rows of the other methods are copied from the results
-        in `out`, which must be of the same items, methods and settings.
+      only: names of the methods to measure anew; all by default. The rows of the other methods are copied from the
+        results in `out`, where those have them, for the same items and settings.
       command: the command to record in the results.
       progress: whether to show progress bars.
       report: called with the title of every part before it is measured.
 
     Raises:
       ValueError, OSError: the data, the model or the limit cannot be used; `only` is empty or names a method that the
-        experiment does not have; or a row to be copied is missing from the results in `out`, or has other settings.
+        experiment does not have; or the results in `out` are of other data or items, or a row there has other settings.
       ImportError: Matplotlib is not installed.
     """
     check_drawing()
@@ -89,7 +89,6 @@ def reproduce(
         "seed": "the number of each item",
         "columns": list(experiment.columns),
         "published_columns": list(experiment.published_columns),
-        "not_built": list(experiment.not_built),
         "thresholds": THRESHOLDS.tolist(),
         "trend_bins": {name: list(edges) for name, edges in TREND_BINS.items()},
         "measured_anew": None if only is None else sorted(only),
@@ -110,6 +109,8 @@ def reproduce(
     draw_recalls(results, out / "recall.png")
     if experiment.trends:
         draw_trends(results, out / "trends.png")
+    if experiment.matrix:
+        draw_matrix(results, out / "matrix.png")
     if experiment.sweeps:
         draw_sweeps(results, out / "sweeps.png")
     return results
@@ -169,7 +170,7 @@ class _Runner:
             rows = [{"method": name, "title": self._find(name).title, "missing": "no data"} for name in methods]
             return result | {"items": 0, "subset": "", "missing": self._no_data(error), "data": None, "rows": rows}
         result |= {"data": source, "data_digest": data_digest(data)}
-        items, subset = self._items(len(data), part.stride)
+        items, subset = self._items(len(data), part.stride, part.first)
         result |= {"items": len(items), "subset": subset}
         rows = [
             self._kept(name, result) or self._row(name, part.protocol, data, items, symmetric, about, trends=trends)
@@ -201,17 +202,16 @@ class _Runner:
         return result | {"rows": rows}
 
     def _kept(self, name: str, result: dict[str, Any]) -> dict[str, Any] | None:
-        """The method's row of the earlier results; None if the method is to be measured."""
+        """The method's row of the earlier results; None if the method is to be measured, or has none there."""
         if self.earlier is None or name in self.earlier.anew:
             return None
-        found = [each for each in self.earlier.sections if all(each.get(key) == result.get(key) for key in _SAME)]
-        rows = [row for each in found for row in each["rows"] if row["method"] == name]
-        if not rows:
-            raise ValueError(
-                f"only: the row {name!r} of {result['title']!r} is not among the earlier results of the same items; "
-                "measure it, too"
-            )
-        row = rows[0]
+        titled = [each for each in self.earlier.sections if each["title"] == result["title"]]
+        found = [each for each in titled if all(each.get(key) == result.get(key) for key in _SAME)]
+        if titled and not found:
+            raise ValueError(f"only: the earlier {result['title']!r} is of other items or data; measure all methods")
+        row = next((row for each in found for row in each["rows"] if row["method"] == name), None)
+        if row is None:  # a new part, or a new method
+            return None
         try:
             identity = json.loads(json.dumps(self._find(name).identity()))
         except ImportError:  # without the library its settings cannot be compared
@@ -227,12 +227,15 @@ class _Runner:
     def _find(self, name: str) -> Method:
         return find_method(name, model=self.model)
 
-    def _items(self, count: int, stride: int) -> tuple[np.ndarray, str]:
+    def _items(self, count: int, stride: int, first: int | None = None) -> tuple[np.ndarray, str]:
         """The indices of the items to measure, and which share of all they are, in words."""
         items = spread(count, self.limit, stride)
-        if len(items) == count:
+        if len(items) == count and (first is None or first >= count):
             return items, f"all {count:,} items"
-        return items, f"every {_ordinal(int(items[1] if len(items) > 1 else count))} item, {len(items):,} of {count:,}"
+        subset = f"every {_ordinal(int(items[1] if len(items) > 1 else count))} item"
+        if first is not None and first < len(items):
+            return items[:first], f"the first {first:,} of {subset}, {count:,} in all"
+        return items, f"{subset}, {len(items):,} of {count:,}"
 
     def _load(self, part: Part) -> tuple[Any, np.ndarray, list[dict], str]:
         """The part's data, whether each item is axisymmetric (S,), facts about each pair of scans, and a name."""

@@ -62,8 +62,6 @@ def part_markdown(results: dict[str, Any], part: dict[str, Any]) -> str:
         cells = [_cell(_value(row, column), column, best[column]) for column in columns]
         failed = f" ({row['failures']} failed)" if row["failures"] else ""
         lines.append(f"| {row['title']}{failed} | " + " | ".join(cells) + " |")
-    if not part["columns"]:
-        lines += [f"| {title} | not built |" + " |" * (len(columns) - 1) for title in results["not_built"]]
     return "\n".join(lines)
 
 

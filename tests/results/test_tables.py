@@ -39,7 +39,6 @@ def test_results_have_the_parts_and_rows_of_the_configuration(name):
     for part, measured in zip(experiment["parts"], results["parts"], strict=True):
         assert [row["method"] for row in measured["rows"]] == part.get("methods", experiment["methods"])
         assert measured["published"].keys() == part.get("published", {}).keys()
-    assert results["not_built"] == experiment.get("not_built", [])
 
 
 @pytest.mark.parametrize("name", ["table1_ablation", "table2_noise", "table3_comparison"])
