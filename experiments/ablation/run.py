@@ -32,6 +32,7 @@ from urrt_jax.model import ModelConfig
 from urrt_jax.training.loop import LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig
+from urrt_jax.training.urrt import URRT
 
 HERE = Path(__file__).parent
 SEEDS = (0, 1, 2)
@@ -47,8 +48,8 @@ VARIANTS: tuple[Variant, ...] = ("A", "B", "C")
 DECODERS: tuple[Decoder, ...] = ("pose", "landmarks")
 
 
-def configured(variant: Variant, decoder: Decoder, seed: int) -> TrainConfig:
-    """How one of the models is trained."""
+def configured(variant: Variant, decoder: Decoder, seed: int) -> tuple[URRT, TrainConfig]:
+    """One of the models, and how it is trained."""
     if decoder == "pose":
         model = ModelConfig(
             variant=variant, decoder="pose", octaves=0, lookups=0, consensus=0, hypotheses=0, steps=1, points=256
@@ -58,10 +59,10 @@ def configured(variant: Variant, decoder: Decoder, seed: int) -> TrainConfig:
         landmarks = 64 if variant == "A" else 8
         model = ModelConfig(variant=variant, landmarks=landmarks, lookups=0, consensus=3, hypotheses=0, steps=1)
         steps, points, loss_points = 300, 1024, 512
-    return TrainConfig(
-        model=model,
+    method = URRT(model=model, loss_points=loss_points)
+    return method, TrainConfig(
+        method=method,
         pairs=PairConfig(points=points, corrupted=0.0, signed=0.0, both_ways=0.0),
-        loss_points=loss_points,
         steps=steps,
         steps_per_call=10,
         seed=seed,
@@ -71,13 +72,14 @@ def configured(variant: Variant, decoder: Decoder, seed: int) -> TrainConfig:
 def measured(variant: Variant, decoder: Decoder, shapes: Shapes, test: Shapes) -> dict[str, Any]:
     """The row of one model: its figures over all test shapes, for every seed."""
     found, configs = [], [configured(variant, decoder, seed) for seed in SEEDS]
-    for config in configs:
+    for method, config in configs:
         held_in, held_out = shapes.split_validation(0.05, config.seed)
         run = HERE / "runs" / f"{variant}_{decoder}_{config.seed}_{config.steps}"
-        model = train(config, held_in, held_out, run, loop=LoopConfig(every=config.steps // 2))
-        found.append(evaluate(Ours(model=model, refine=None), "dcp", test.points, progress=False).summary())
+        variables = train(config, held_in, held_out, run, loop=LoopConfig(every=config.steps // 2))
+        ours = Ours(model=method.as_model(variables), refine=None)
+        found.append(evaluate(ours, "dcp", test.points, progress=False).summary())
     values = {name: [one[name] for one in found] for name in METRICS}
-    return {"variant": variant, "decoder": decoder, "steps": configs[0].steps} | values
+    return {"variant": variant, "decoder": decoder, "steps": configs[0][1].steps} | values
 
 
 def as_markdown(results: dict[str, Any]) -> str:

@@ -24,9 +24,11 @@ from urrt_jax.atomic import write_atomically
 from urrt_jax.data import Shapes, load_shapes
 from urrt_jax.evaluation import evaluate
 from urrt_jax.evaluation.methods import Ours
+from urrt_jax.model import ModelConfig
 from urrt_jax.training.loop import LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig
+from urrt_jax.training.urrt import URRT
 
 HERE = Path(__file__).parent
 PROTOCOLS = {
@@ -92,10 +94,20 @@ TRIALS: dict[str, dict[str, Any]] = {
 }
 
 
+_METHOD = {field.name for field in dataclasses.fields(URRT)}
+
+
+def method(changes: dict[str, Any]) -> URRT:
+    """What a trial trains: our network with those of the changes that are its own."""
+    own = {name: value for name, value in changes.items() if name in _METHOD - {"model"}}
+    return URRT(model=ModelConfig(**changes.get("model", {})), **own)
+
+
 def configured(changes: dict[str, Any]) -> TrainConfig:
     """How a trial is trained: the base with these changes; "model" and "pairs" change its parts, "use" nothing yet."""
-    parts = {name: dataclasses.replace(getattr(BASE, name), **changes.get(name, {})) for name in ("model", "pairs")}
-    return dataclasses.replace(BASE, **{name: value for name, value in changes.items() if name != "use"} | parts)
+    others = {name: value for name, value in changes.items() if name not in _METHOD | {"pairs", "use"}}
+    pairs = dataclasses.replace(BASE.pairs, **changes.get("pairs", {}))
+    return dataclasses.replace(BASE, method=method(changes), pairs=pairs, **others)
 
 
 def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
@@ -103,16 +115,17 @@ def run_trial(name: str, shapes: Shapes, validation: Shapes) -> dict[str, Any]:
     config = configured(TRIALS[name])
     digest = hashlib.sha256(repr(config).encode()).hexdigest()[:8]
     folder = HERE / "runs" / digest
-    model = train(config, shapes, validation, folder, loop=LoopConfig(every=config.steps, validation_pairs=16))
+    variables = train(config, shapes, validation, folder, loop=LoopConfig(every=config.steps, validation_pairs=16))
+    model = method(TRIALS[name]).as_model(variables)
     model = dataclasses.replace(model, config=dataclasses.replace(model.config, **TRIALS[name].get("use", {})))
     log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     rates = [entry["pairs_per_second"] for entry in log if "pairs_per_second" in entry]
-    method = Ours(model=model, refine=None)
+    ours = Ours(model=model, refine=None)
     return {
         "trial": name,
         "changes": _as_json(TRIALS[name]),
         "errors": {
-            protocol: evaluate(method, protocol, validation.points[::2], progress=False).summary()["mae_rotation"]
+            protocol: evaluate(ours, protocol, validation.points[::2], progress=False).summary()["mae_rotation"]
             for protocol in PROTOCOLS
         },
         "pairs_per_second": float(np.median(rates[1:] or rates)),
@@ -135,7 +148,7 @@ def _as_json(value: Any) -> Any:
 
 def keep(row: dict[str, Any], data: str) -> list[dict[str, Any]]:
     """Writes a trial's row beside those that are there, of the same base, and returns them all in order."""
-    written, base = HERE / "results.json", _as_json(dataclasses.asdict(BASE))
+    written, base = HERE / "results.json", _as_json(BASE.as_dict())
     before = json.loads(written.read_text()) if written.exists() else {}
     # Of another base or other data they would not compare. Read only now: commands may run side by side.
     command = f"python experiments/trials/run.py --data {data}"

@@ -2,8 +2,11 @@
 
 import dataclasses
 import json
+import sys
+import typing
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -16,6 +19,7 @@ from urrt_jax.model import ModelConfig
 from urrt_jax.training.loop import LoopConfig
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig
+from urrt_jax.training.urrt import URRT
 
 
 def test_training_keeps_what_jax_compiles_beside_the_programs(tmp_path, monkeypatch):
@@ -35,18 +39,24 @@ def test_training_keeps_what_jax_compiles_beside_the_programs(tmp_path, monkeypa
 
 @pytest.mark.parametrize(
     ("flags", "config"),
-    [(NetworkFlags(), ModelConfig()), (PairFlags(), PairConfig()), (Train(out=Path("x")), TrainConfig())],
-    ids=["model", "pairs", "train"],
+    [
+        (NetworkFlags(), ModelConfig()),
+        (PairFlags(), PairConfig()),
+        (Train(out=Path("x")), TrainConfig()),
+        (Train(out=Path("x")), URRT()),
+    ],
+    ids=["model", "pairs", "train", "urrt"],
 )
 def test_flags_of_train_have_the_librarys_defaults(flags, config):
-    mirrored = {field.name for field in dataclasses.fields(config)} & vars(flags).keys() - {"model", "pairs"}
-    assert len(mirrored) >= 6
+    others = {"method", "model", "pairs", "learning_rate"}
+    mirrored = {field.name for field in dataclasses.fields(config)} & vars(flags).keys() - others
+    assert len(mirrored) >= 5
     assert {name: getattr(flags, name) for name in mirrored} == {name: getattr(config, name) for name in mirrored}
 
 
 def test_watching_flags_of_train_have_the_librarys_defaults():
     flags, loop = Train(out=Path("x")), LoopConfig()
-    for name in ("every", "log_every", "validation_pairs", "patience"):
+    for name in ("every", "log_every", "validation_pairs", "patience", "minutes"):
         assert getattr(flags, name) == getattr(loop, name)
 
 
@@ -59,24 +69,36 @@ def test_command_of_train_names_no_path():
     assert flags.command() == "urrt train --out one --data shapes.npz --steps 7 --pairs.noise 0.1"
 
 
-def test_train_writes_the_model_with_its_card(files, capsys, tmp_path, monkeypatch):
+def _write_log(directory) -> None:
+    """The log of a run of 20 steps, stopped once, whose first validation was the better one."""
+    directory.mkdir()
+    lines = [
+        {"kind": "train", "step": 5, "loss": 0.3, "seconds": 60.0},
+        {"kind": "stop", "step": 7, "seconds": 61.5},
+        {"kind": "validation", "step": 10, "validation_loss": 0.1},
+        {"kind": "train", "step": 20, "loss": 0.3, "seconds": 90.5},
+        {"kind": "validation", "step": 20, "validation_loss": 0.2},
+    ]
+    (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_train_writes_the_model_with_its_card(capsys, tmp_path, monkeypatch):
     def fake_train(config, shapes, validation, directory, *, loop):
         assert (config.steps, config.pairs.points, loop.every) == (20, 64, 10)
-        directory.mkdir()
-        validations = [
-            {"kind": "validation", "step": step, "validation_loss": loss} for step, loss in ((10, 0.1), (20, 0.2))
-        ]
-        lines = [{"kind": "train", "step": 5, "loss": 0.3}, *validations]
-        (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-        return urrt_jax.load_model(files["model.npz"])
+        _write_log(directory)
+        return jax.jit(config.method.init)(jax.random.key(0))
 
     monkeypatch.setattr("urrt_jax.training.loop.train", fake_train)
-    flags = "--limit 6 --validation-share 0.3 --steps 20 --loss-points 32 --every 10 --pairs.points 64"
+    network = "--model.regions 2 --model.width 16 --model.landmarks 2"
+    flags = f"--limit 6 --validation-share 0.3 --steps 20 --loss-points 32 --every 10 {network} --pairs.points 64"
     assert cli.main(["train", "--out", str(tmp_path / "run"), *flags.split()]) == 0
     assert urrt_jax.load_model(tmp_path / "run" / "model.npz").config.width == 16
     card = urrt_jax.model_card(tmp_path / "run" / "model.npz")
     assert card["command"] == f"urrt train --out run {flags}"
     assert (card["data"], card["shapes"], card["validation_shapes"], card["steps"]) == ("procedural", 4, 2, 20)
+    assert card["seconds"] == 90.5
+    assert card["occupancy"] == "a shell around each cloud"
+    assert card["training"]["method"]["name"] == "urrt"
     assert card["validation"] == {"step": 10, "validation_loss": 0.1}
     assert card["versions"]["urrt_jax"] == urrt_jax.__version__
     assert str(tmp_path) not in json.dumps(card)
@@ -103,3 +125,70 @@ def test_interrupted_training_says_how_to_continue(capsys, tmp_path, monkeypatch
     monkeypatch.setattr("urrt_jax.training.loop.train", interrupt)
     assert cli.main(["train", "--out", str(tmp_path), "--limit", "4"]) == 130
     assert "the same command continues" in capsys.readouterr().err
+
+
+@dataclasses.dataclass(frozen=True)
+class Peer:
+    """What the command knows of another learned method."""
+
+    neighbors: int = 20
+    name: typing.ClassVar[str] = "dcp_v2"
+    learning_rate: typing.ClassVar[float] = 2e-4
+
+
+@pytest.fixture
+def peers(monkeypatch) -> list:
+    """One other method in the place of all; the list gets what is saved of it."""
+    saved = []
+
+    def save_network(network, variables, path, card):
+        saved.append((network, variables, path, card))
+        return path
+
+    module = SimpleNamespace(NETWORKS={"dcp_v2": Peer()}, save_network=save_network)
+    monkeypatch.setitem(sys.modules, "urrt_jax.peers.learned.weights", module)
+    return saved
+
+
+def test_train_offers_every_learned_peer():
+    weights = pytest.importorskip("urrt_jax.peers.learned.weights", reason="the other methods are not there")
+    offered = typing.get_args(typing.get_type_hints(Train, vars(sys.modules[Train.__module__]))["method"])
+    assert set(offered) == {"urrt", *weights.NETWORKS}
+
+
+def test_other_method_is_trained_at_its_published_learning_rate_unless_told(peers):
+    flags = Train(out=Path("x"), method="dcp_v2")
+    assert flags.config() == TrainConfig(method=Peer(), learning_rate=2e-4)
+    assert dataclasses.replace(flags, learning_rate=5e-4).config().learning_rate == 5e-4
+
+
+@pytest.mark.parametrize(
+    "flags",
+    ["--model.width 64", "--occupancy-weight 0.1", "--loss-points 64", "--unrolled 1", "--lookups 8", "--rounds 2",
+     "--queries 100"],
+)  # fmt: skip
+def test_flag_of_our_network_with_another_method_is_wrong_use(peers, capsys, tmp_path, flags):
+    assert cli.main(["train", "--out", str(tmp_path / "run"), "--method", "dcp_v2", *flags.split()]) == 2
+    name = flags.split()[0]
+    assert f"error: {name}: only for our own network, not for --method dcp_v2" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_other_method_is_saved_with_a_card_that_says_nothing_of_regions(peers, capsys, tmp_path, monkeypatch):
+    variables = {"params": {}, "batch_stats": {}}
+
+    def fake_train(config, shapes, validation, directory, *, loop):
+        assert (config.method, loop.minutes) == (Peer(), 1.5)
+        _write_log(directory)
+        return variables
+
+    monkeypatch.setattr("urrt_jax.training.loop.train", fake_train)
+    flags = "--method dcp_v2 --limit 6 --validation-share 0.3 --minutes 1.5 --pairs.points 64"
+    assert cli.main(["train", "--out", str(tmp_path / "run"), *flags.split()]) == 0
+    ((network, saved, path, card),) = peers
+    assert (network, saved, path) == (Peer(), variables, tmp_path / "run" / "model.npz")
+    assert card["command"] == f"urrt train --out run {flags}"
+    assert card["training"]["method"] == {"name": "dcp_v2", "neighbors": 20}
+    assert (card["steps"], card["seconds"]) == (20, 90.5)
+    assert "occupancy" not in card
+    assert "regions" not in capsys.readouterr().err

@@ -27,8 +27,7 @@ from urrt_jax.model.partition import (
     split_regions,
 )
 from urrt_jax.training.pairs import PairConfig, make_pair
-from urrt_jax.training.state import TrainConfig
-from urrt_jax.training.step import pair_loss
+from urrt_jax.training.urrt import URRT
 
 _predict, _estimate, _encode = (jax.jit(each) for each in (predict, estimate, encode))
 _init = jax.jit(init_model, static_argnums=1)
@@ -244,15 +243,11 @@ def loss_gradient(small_model, cloud):
     """A function of the occupancy weight: the gradient of the mean training loss of four pairs."""
     pairs = PairConfig(points=64)
     batch = jax.vmap(lambda key: make_pair(key, jnp.asarray(cloud), pairs, 0.0))(jax.random.split(jax.random.key(0), 4))
-
-    config = TrainConfig(
-        model=small_model.config, pairs=pairs, loss_points=64, occupancy_queries=64, occupancy_weight=0.0
-    )
+    method = URRT(model=small_model.config, loss_points=64, occupancy_queries=64, occupancy_weight=0.0)
 
     def losses(params):
-        model = Model(config.training_network(), params)
-        _, metrics = jax.vmap(lambda one: pair_loss(model, one, jax.random.key(1), config))(batch)
-        return jnp.array([jnp.mean(metrics["loss"]), jnp.mean(metrics["occupancy"])])
+        loss, metrics, _ = jax.vmap(lambda one: method.loss({"params": params}, one, jax.random.key(1)))(batch)
+        return jnp.array([jnp.mean(loss), jnp.mean(metrics["occupancy"])])
 
     jacobian = jax.jit(jax.jacrev(losses))(small_model.params)
     parts = [jax.tree.map(lambda leaf, i=i: leaf[i], jacobian) for i in range(2)]

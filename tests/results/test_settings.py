@@ -54,16 +54,16 @@ def test_training_command_of_the_card_gives_its_configuration(name):
     """With today's defaults, which may have been others when the weights were trained."""
     card, model = model_card(name), load_model(name)
     config = tyro.cli(Train, args=shlex.split(card["command"])[2:]).config()
-    assert json.loads(json.dumps(dataclasses.asdict(config))) == card["training"]
+    assert json.loads(json.dumps(config.as_dict())) == card["training"]
     # These four may be chosen again after training.
     chosen = {field: getattr(model.config, field) for field in ("steps", "lookups", "consensus", "hypotheses")}
-    assert dataclasses.replace(config.model, **chosen) == model.config
+    assert dataclasses.replace(config.method.model, **chosen) == model.config
 
 
 def test_trials_are_those_of_the_script():
     script = runpy.run_path(str(HERE / "trials" / "run.py"))
     results = load("trials")
-    assert results["base"] == script["_as_json"](dataclasses.asdict(script["BASE"]))
+    assert results["base"] == script["_as_json"](script["BASE"].as_dict())
     for row in results["rows"]:
         assert row["changes"] == script["_as_json"](script["TRIALS"][row["trial"]])
     assert (HERE / "trials" / "table.md").read_text() == script["as_markdown"](results["rows"])

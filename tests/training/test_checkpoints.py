@@ -20,6 +20,7 @@ from urrt_jax import ModelConfig
 from urrt_jax.training.checkpoints import Checkpoints
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig, TrainState, init_state
+from urrt_jax.training.urrt import URRT
 
 # Where a load fails, Orbax leaves other reads unfinished: they end after its event loop, or are never awaited.
 pytestmark = [
@@ -27,11 +28,13 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning"),
 ]
 _CONFIG = TrainConfig(
-    model=ModelConfig(
-        regions=2, width=4, encoder_widths=(4,), branch_width=4, position_widths=(4,), decoder_widths=(4,)
+    method=URRT(
+        model=ModelConfig(
+            regions=2, width=4, encoder_widths=(4,), branch_width=4, position_widths=(4,), decoder_widths=(4,)
+        ),
+        loss_points=16,
     ),
     pairs=PairConfig(points=16),
-    loss_points=16,
     steps=10,
 )
 
@@ -44,7 +47,7 @@ def state() -> TrainState:
 def _at(state: TrainState, step: int) -> TrainState:
     """A state that tells which step it is from, in every leaf."""
     params = jax.tree.map(lambda leaf: jnp.full_like(leaf, step), state.params)
-    return TrainState(jnp.asarray(step, jnp.int32), params, state.opt_state)
+    return dataclasses.replace(state, step=jnp.asarray(step, jnp.int32), params=params)
 
 
 def _assert_same(first, second):
@@ -103,13 +106,13 @@ def test_same_step_twice_is_saved_once(tmp_path, state):
 def test_another_configuration_is_refused_and_the_fields_are_listed(tmp_path):
     with Checkpoints(tmp_path, _CONFIG):
         pass
-    other = dataclasses.replace(
-        _CONFIG, learning_rate=5e-4, model=dataclasses.replace(_CONFIG.model, regions=3), pairs=PairConfig(points=17)
-    )
+    method = dataclasses.replace(_CONFIG.method, model=dataclasses.replace(_CONFIG.method.model, regions=3))
+    other = dataclasses.replace(_CONFIG, learning_rate=5e-4, method=method, pairs=PairConfig(points=17))
     with pytest.raises(ValueError, match="another configuration") as caught:
         Checkpoints(tmp_path, other)
     message = str(caught.value)
-    for said in ("learning_rate: 0.001 there, 0.0005 now", "model.regions: 2 there, 3 now", "pairs.points: 16 there"):
+    regions = "method.model.regions: 2 there, 3 now"
+    for said in ("learning_rate: 0.001 there, 0.0005 now", regions, "pairs.points: 16 there"):
         assert said in message
     assert "model.width" not in message
 
@@ -117,7 +120,7 @@ def test_another_configuration_is_refused_and_the_fields_are_listed(tmp_path):
 def test_the_configuration_lies_beside_the_checkpoints_as_json(tmp_path):
     with Checkpoints(tmp_path, _CONFIG):
         pass
-    assert json.loads((tmp_path / "config.json").read_text())["model"]["regions"] == 2
+    assert json.loads((tmp_path / "config.json").read_text())["method"]["model"]["regions"] == 2
 
 
 def test_a_leftover_temporary_folder_does_not_count(tmp_path, state):
@@ -283,7 +286,7 @@ _SAVER = """
     with Checkpoints(sys.argv[1], TrainConfig()) as checkpoints:
         for step in range(1, 10_000):
             leaf = jnp.full((1024, 1024), step, jnp.float32)
-            state = TrainState(jnp.asarray(step, jnp.int32), {"a": leaf, "b": leaf, "c": leaf}, (leaf,))
+            state = TrainState(jnp.asarray(step, jnp.int32), {"a": leaf, "b": leaf}, {"c": leaf}, (leaf,))
             checkpoints.save(state, 1.0 / step)
             print(step, flush=True)
 """
@@ -309,13 +312,13 @@ def test_a_save_killed_in_the_middle_leaves_whole_checkpoints_only(tmp_path, wai
         saver.wait()
         saver.stdout.close()
     leaf = jnp.zeros((1024, 1024))
-    like = TrainState(jnp.zeros((), jnp.int32), {"a": leaf, "b": leaf, "c": leaf}, (leaf,))
+    like = TrainState(jnp.zeros((), jnp.int32), {"a": leaf, "b": leaf}, {"c": leaf}, (leaf,))
     with Checkpoints(tmp_path, TrainConfig()) as checkpoints:
         restored = checkpoints.restore_latest(like)
         assert restored is not None
         step = int(restored.step)
         # Saves are one behind at most: the next one waits for the one before.
         assert begun - 2 <= step <= begun
-        assert all(bool(jnp.all(leaf == step)) for leaf in jax.tree.leaves((restored.params, restored.opt_state)))
-        checkpoints.save(TrainState(jnp.asarray(step + 1, jnp.int32), restored.params, restored.opt_state), 0.0)
+        assert all(bool(jnp.all(leaf == step)) for leaf in jax.tree.leaves((restored.variables, restored.opt_state)))
+        checkpoints.save(dataclasses.replace(restored, step=jnp.asarray(step + 1, jnp.int32)), 0.0)
     assert not [name for name in _folders(tmp_path) if "tmp" in name]

@@ -18,9 +18,10 @@ from urrt_jax.training.loop import Log, LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.state import TrainConfig, init_state
 from urrt_jax.training.step import train_steps
+from urrt_jax.training.urrt import URRT
 from urrt_jax.training.validation import validate, validation_pairs
 
-_CONFIG = TrainConfig(
+_METHOD = URRT(
     model=ModelConfig(
         regions=2,
         width=8,
@@ -35,9 +36,12 @@ _CONFIG = TrainConfig(
         steps=1,
         points=32,
     ),
-    pairs=PairConfig(points=32, corrupted=0.5, clean_share=0.0, ramp_share=0.5),
     loss_points=32,
     occupancy_queries=16,
+)
+_CONFIG = TrainConfig(
+    method=_METHOD,
+    pairs=PairConfig(points=32, corrupted=0.5, clean_share=0.0, ramp_share=0.5),
     batch=4,
     steps=10,
     warmup=2,
@@ -49,6 +53,11 @@ _LOOP = LoopConfig(every=5, log_every=1, validation_pairs=4, progress=False)
 def _mesh():
     """The mesh that ``train`` makes: under it a step of the same configuration is compiled once for all tests."""
     return jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
+
+
+def _with(**changes) -> TrainConfig:
+    """The configuration with these changes of the method."""
+    return dataclasses.replace(_CONFIG, method=dataclasses.replace(_METHOD, **changes))
 
 
 def _everywhere(tree):
@@ -82,10 +91,10 @@ def _last_state(directory, config):
 
 @pytest.fixture(scope="module")
 def unbroken(shapes, tmp_path_factory):
-    """A run of ten steps: its folder, its model and its last state."""
+    """A run of ten steps: its folder, its variables and its last state."""
     directory = tmp_path_factory.mktemp("unbroken")
-    model = train(_CONFIG, shapes, shapes, directory, loop=_LOOP)
-    return directory, model, _last_state(directory, _CONFIG)
+    variables = train(_CONFIG, shapes, shapes, directory, loop=_LOOP)
+    return directory, variables, _last_state(directory, _CONFIG)
 
 
 def _interrupted(at: int):
@@ -108,8 +117,8 @@ def resumed(shapes, tmp_path_factory):
         patch.setattr(loop_module, "train_steps", _interrupted(7))
         train(_CONFIG, shapes, shapes, directory, loop=_LOOP)
     stopped = int(_last_state(directory, _CONFIG).step)
-    model = train(_CONFIG, shapes, shapes, directory, loop=_LOOP)
-    return directory, model, _last_state(directory, _CONFIG), stopped
+    variables = train(_CONFIG, shapes, shapes, directory, loop=_LOOP)
+    return directory, variables, _last_state(directory, _CONFIG), stopped
 
 
 def test_interrupted_run_saves_the_step_it_had_reached(resumed):
@@ -133,10 +142,10 @@ def test_resumed_run_logs_the_same_validations(resumed, unbroken):
 
 
 def test_finished_run_started_again_changes_nothing(shapes, unbroken):
-    directory, model, _ = unbroken
+    directory, variables, _ = unbroken
     before = (directory / "metrics.jsonl").read_text()
     again = train(_CONFIG, shapes, shapes, directory, loop=_LOOP)
-    jax.tree.map(np.testing.assert_array_equal, again.params, model.params)
+    jax.tree.map(np.testing.assert_array_equal, again, variables)
     assert (directory / "metrics.jsonl").read_text() == before
 
 
@@ -162,21 +171,23 @@ def test_steps_per_call_do_not_change_the_parameters(arrays):
 
 def test_training_does_no_more_than_it_is_asked_for(arrays):
     """A network that does more in use learns as one does that never does more."""
-    few = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=1, consensus=0))
-    many = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=3, lookups=16, consensus=8))
+    few = _with(model=dataclasses.replace(_METHOD.model, steps=1, consensus=0))
+    more = dataclasses.replace(_METHOD.model, steps=3, lookups=16, consensus=8)
+    many = _with(model=more, unrolled=1, lookups=8, rounds=0)
     first, _ = _step(_fresh(few), arrays, few)
-    second, _ = _step(_fresh(many), arrays, dataclasses.replace(many, unrolled=1, lookups=8, rounds=0))
+    second, _ = _step(_fresh(many), arrays, many)
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
 
 
 def test_validation_runs_the_steps_that_use_runs(arrays):
     """However few of them are trained."""
-    config = dataclasses.replace(_CONFIG, model=dataclasses.replace(_CONFIG.model, steps=3), unrolled=1)
-    params, pairs = _fresh(config).params, validation_pairs(config, arrays, 4)
-    found = validate(params, pairs, config)
-    assert found == validate(params, pairs, dataclasses.replace(config, unrolled=3))
-    one_step = dataclasses.replace(config, model=dataclasses.replace(config.model, steps=1))
-    assert found["clean_chamfer"] != validate(params, pairs, one_step)["clean_chamfer"]
+    model = dataclasses.replace(_METHOD.model, steps=3)
+    config = _with(model=model, unrolled=1)
+    variables, pairs = _fresh(config).variables, validation_pairs(config, arrays, 4)
+    found = validate(variables, pairs, config)
+    assert found == validate(variables, pairs, _with(model=model, unrolled=3))
+    one_step = _with(model=dataclasses.replace(model, steps=1), unrolled=1)
+    assert found["clean_loss"] != validate(variables, pairs, one_step)["clean_loss"]
 
 
 def test_a_step_changes_the_parameters(arrays):
@@ -300,18 +311,19 @@ def test_log_knows_whether_validation_has_stalled(tmp_path, losses, patience, st
     assert Log(tmp_path / "metrics.jsonl", 100).stalled(patience) is stalled
 
 
-def test_run_stops_early_and_returns_the_best_model(shapes, tmp_path, monkeypatch):
+def test_run_stops_early_and_returns_the_best_variables(shapes, tmp_path, monkeypatch):
     losses = iter([0.5, 0.3, 0.4, 0.6, 0.1])
     seen = []
 
-    def worsening(params, pairs, config):
-        seen.append(jax.device_get(params))
+    def worsening(variables, pairs, config):
+        seen.append(jax.device_get(variables))
         return {"validation_loss": next(losses)}
 
     monkeypatch.setattr(loop_module, "validate", worsening)
-    model = train(_CONFIG, shapes, shapes, tmp_path, loop=dataclasses.replace(_LOOP, every=2, log_every=2, patience=2))
+    loop = dataclasses.replace(_LOOP, every=2, log_every=2, patience=2)
+    best = train(_CONFIG, shapes, shapes, tmp_path, loop=loop)
     assert [line["step"] for line in _lines(tmp_path, "validation")] == [2, 4, 6, 8]
-    jax.tree.map(np.testing.assert_array_equal, model.params, seen[1])
+    jax.tree.map(np.testing.assert_array_equal, best, seen[1])
 
 
 @pytest.mark.parametrize("name", ["every", "log_every"])
@@ -330,13 +342,25 @@ def test_interval_that_does_not_fit_the_steps_per_call_is_named(shapes, tmp_path
         ({"learning_rate": 0.0}, "^learning_rate: .*0.0"),
         ({"clip": float("nan")}, "^clip: .*nan"),
         ({"warmup": -1}, "^warmup: .*-1"),
-        ({"unrolled": 0}, "^unrolled: .*0"),
-        ({"rounds": -1}, "^rounds: .*-1"),
-        ({"lookups": -1}, "^lookups: .*-1"),
         ({"steps": 10, "steps_per_call": 3}, "^steps_per_call: 3 does not divide steps, 10"),
-        ({"loss_points": 2000}, "^loss_points: 2000 exceeds"),
+        ({"method": URRT(loss_points=2000)}, "^loss_points: 2000 exceeds"),
     ],
 )
 def test_train_config_refuses_and_names_the_field(fields, says):
     with pytest.raises(ValueError, match=says):
         TrainConfig(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"unrolled": 0}, "^unrolled: .*0"),
+        ({"rounds": -1}, "^rounds: .*-1"),
+        ({"lookups": -1}, "^lookups: .*-1"),
+        ({"chamfer_scale": 0.0}, "^chamfer_scale: .*0.0"),
+        ({"occupancy_weight": -0.1}, "^occupancy_weight: .*-0.1"),
+    ],
+)
+def test_our_method_refuses_and_names_the_field(fields, says):
+    with pytest.raises(ValueError, match=says):
+        URRT(**fields)

@@ -106,7 +106,7 @@ def _parse(arguments: Sequence[str] | None) -> Any:
     commands = {
         "register": (Register, "Align two clouds, or many with one target."),
         "demo": (Demo, "Register a made-up shape to its copy in a random pose."),
-        "train": (Train, "Train a network on shapes, without labels."),
+        "train": (Train, "Train our network on shapes, without labels, or a learned method to compare it with."),
         "evaluate": (Evaluate, "Measure the errors of registration methods over a data set."),
         "info": (Info, "Show versions, devices, packaged models and the cache of compiled programs."),
     }

@@ -1,17 +1,17 @@
-"""``urrt train``: a model from shapes, without labels."""
+"""``urrt train``: our network from shapes, without labels, or a learned method of the tables by its own loss."""
 
 from __future__ import annotations
 
 import json
 import os
 import shlex
-import time
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from urrt_jax.training.state import TrainConfig
+    from urrt_jax.training.trainable import Trainable, Variables
 
 # These mirror the library's configurations, with the same names and defaults (a test compares them): importing those
 # would import JAX, and --help would take seconds.
@@ -86,21 +86,30 @@ class PairFlags:
     outliers: float = 0.2
 
 
+_OURS = ("model", "queries", "occupancy_weight", "loss_points", "unrolled", "lookups", "rounds")
+"""The flags that belong to our own network."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a network on shapes, without labels. The same command continues a run that was stopped.
+    """Train our network on shapes, without labels; or, with --method, a learned method that it is compared with, by the
+    loss of its paper, on the same pairs and with the same optimiser.
 
-    The folder gets config.json, metrics.jsonl, checkpoints/ and at the end model.npz with its card model.json:
-    'urrt register A B --model DIR/model.npz' uses it. Ctrl-C saves first.
+    The same command continues a run that was stopped. The folder gets config.json, metrics.jsonl, checkpoints/ and at
+    the end model.npz with its card model.json: 'urrt register A B --model DIR/model.npz' uses our network. Ctrl-C
+    saves first.
 
     A trial run on made-up shapes: urrt train --out runs/trial --steps 100 --every 50
 
     On ModelNet40: urrt train --out runs/modelnet40 --data ModelNet40/
 
+    Another method: urrt train --out runs/dcp --data ModelNet40/ --method dcp_v2
+
     Exit codes: 0, the model was written. 2, wrong use or bad input. 130, stopped by Ctrl-C.
 
     Attributes:
         out: Folder of the run.
+        method: What is trained: 'urrt', our network, or another learned method.
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes or clouds; by default $URRT_DATA,
             else 'procedural'. Each file is a whole shape; a cloud needs at least --pairs.points points.
         limit: Use at most this many shapes.
@@ -110,7 +119,8 @@ class Train:
         validation_share: Share of the training shapes that is held out to choose the best checkpoint by.
         steps: Optimiser steps.
         batch: Pairs a step.
-        learning_rate: Its peak; it falls to a hundredth by the end.
+        learning_rate: Its peak; it falls to a hundredth by the end. By default the published one of the method; of
+            ours 1e-3.
         warmup: Steps in which the learning rate rises.
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
@@ -124,11 +134,16 @@ class Train:
         log_every: Steps between lines of metrics.jsonl.
         validation_pairs: Pairs of each kind in a validation.
         patience: Validations without a better one after which training stops; 0: never.
-        model: The network.
+        minutes: Minutes of training in all after which it stops, stopped runs counted on and validations not counted;
+            by default there is no limit. The learning rate falls with --steps all the same.
+        model: Our network.
         pairs: The training pairs.
     """
 
     out: Path
+    method: Literal[
+        "urrt", "dcp_v1", "dcp_v2", "prnet", "rpmnet", "deepgmr", "pointnetlk", "pointnetlk_revisited", "rienet"
+    ] = "urrt"
     data: str | None = None
     limit: int | None = None
     categories: int | None = None
@@ -136,7 +151,7 @@ class Train:
     validation_share: float = 0.05
     steps: int = 8_000
     batch: int = 32
-    learning_rate: float = 1e-3
+    learning_rate: float | None = None
     warmup: int = 200
     occupancy_weight: float = 0.02
     loss_points: int = 512
@@ -149,21 +164,47 @@ class Train:
     log_every: int = 50
     validation_pairs: int = 256
     patience: int = 0
+    minutes: float | None = None
     model: NetworkFlags = NetworkFlags()
     pairs: PairFlags = PairFlags()
 
     def config(self) -> TrainConfig:
-        """The library's configuration of this run."""
-        from urrt_jax.model import ModelConfig
+        """The library's configuration of this run.
+
+        Raises:
+          ValueError: a flag of our network was given with another method, or a value is refused.
+        """
         from urrt_jax.training.pairs import PairConfig
         from urrt_jax.training.state import TrainConfig
 
-        names = {field.name for field in fields(TrainConfig)} - {"model", "pairs"}
+        method, learning_rate = self._method()
+        names = {field.name for field in fields(TrainConfig)} - {"method", "pairs", "learning_rate"}
         return TrainConfig(
-            model=ModelConfig(**asdict(self.model)),
+            method=method,
             pairs=PairConfig(**asdict(self.pairs)),
+            learning_rate=learning_rate if self.learning_rate is None else self.learning_rate,
             **{name: value for name, value in vars(self).items() if name in names},
         )
+
+    def _method(self) -> tuple[Trainable, float]:
+        """What is trained, and its published learning rate."""
+        if self.method == "urrt":
+            from urrt_jax.model import ModelConfig
+            from urrt_jax.training.state import TrainConfig
+            from urrt_jax.training.urrt import URRT
+
+            names = {field.name for field in fields(URRT)} - {"model"}
+            own = {name: value for name, value in vars(self).items() if name in names}
+            return URRT(model=ModelConfig(**asdict(self.model)), **own), TrainConfig.learning_rate
+
+        from urrt_jax.cli.printing import changed_flags
+        from urrt_jax.peers.learned.weights import NETWORKS
+
+        ours = tuple("--" + name.replace("_", "-") for name in _OURS)
+        if wrong := [flag for flag in changed_flags(self) if flag.partition(".")[0] in ours]:
+            raise ValueError(f"{', '.join(wrong)}: only for our own network, not for --method {self.method}")
+        network = NETWORKS[self.method]
+        return network, network.learning_rate
 
     def run(self) -> int:
         """Trains, and writes the best model with its card."""
@@ -171,7 +212,7 @@ class Train:
 
         import jax
 
-        from urrt_jax import __version__, save_model
+        from urrt_jax import __version__
         from urrt_jax.cli.interrupt import leave_ctrl_c_to_python
         from urrt_jax.cli.printing import print_skipped
         from urrt_jax.cli.streams import note
@@ -184,6 +225,7 @@ class Train:
             log_every=self.log_every,
             validation_pairs=self.validation_pairs,
             patience=self.patience,
+            minutes=self.minutes,
         )
         loaded = load_shapes(source, points=self.pairs.points, limit=self.limit, queries=self.queries, progress=True)
         if self.categories is not None:
@@ -191,36 +233,47 @@ class Train:
         shapes, validation = loaded.split_validation(self.validation_share, self.seed)
         note(f"{len(shapes)} shapes to train on, {len(validation)} held out")
         print_skipped(loaded.skipped)
-        occupancy = "a shell around each cloud" if loaded.queries is None else "inside and outside of closed meshes"
-        note(f"the regions learn from {occupancy}")
-        resumed, start = (self.out / "config.json").exists(), time.perf_counter()
+        own = {}
+        if self.method == "urrt":
+            surface = "a shell around each cloud" if loaded.queries is None else "inside and outside of closed meshes"
+            note(f"the regions learn from {surface}")
+            own = {"occupancy": surface}
         leave_ctrl_c_to_python()  # the loop saves first
         try:
-            model = train(config, shapes, validation, self.out, loop=loop)
+            variables = train(config, shapes, validation, self.out, loop=loop)
         except KeyboardInterrupt:
             note(f"stopped; the same command continues the run in {self.out}")
             return 130
-        path = save_model(
-            model,
-            self.out / "model.npz",
-            {
-                "command": self.command(),
-                "data": Path(source).name,
-                "shapes": len(shapes),
-                "validation_shapes": len(validation),
-                "steps": config.steps,
-                # A resumed run's time is not known.
-                "seconds": None if resumed else round(time.perf_counter() - start, 1),
-                "occupancy": occupancy,
-                "training": asdict(config),
-                "versions": {"urrt_jax": __version__} | {name: version(name) for name in ("jax", "flax", "optax")},
-                "processor": f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}",
-                "validation": best_validation(self.out / "metrics.jsonl"),
-                "log": validations(self.out / "metrics.jsonl"),
-            },
-        )
+        log = self.out / "metrics.jsonl"
+        steps, seconds = trained(log)
+        card = {
+            "command": self.command(),
+            "data": Path(source).name,
+            "shapes": len(shapes),
+            "validation_shapes": len(validation),
+            "steps": steps,
+            "seconds": seconds,
+            **own,
+            "training": config.as_dict(),
+            "versions": {"urrt_jax": __version__} | {name: version(name) for name in ("jax", "flax", "optax")},
+            "processor": f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}",
+            "validation": best_validation(log),
+            "log": validations(log),
+        }
+        path = self._save(config.method, variables, card)
         note(f"wrote {path}")
         return 0
+
+    def _save(self, method: Any, variables: Variables, card: dict[str, Any]) -> Path:
+        """Writes what was trained, and returns the path of its arrays."""
+        if self.method == "urrt":
+            from urrt_jax import save_model
+
+            return save_model(method.as_model(variables), self.out / "model.npz", card)
+
+        from urrt_jax.peers.learned.weights import save_network
+
+        return save_network(method, variables, self.out / "model.npz", card)
 
     def command(self) -> str:
         """The command line of this run, with names in the place of paths."""
@@ -229,10 +282,15 @@ class Train:
         return shlex.join(["urrt", "train", *changed_flags(self)])
 
 
+def trained(log: Path) -> tuple[int, float]:
+    """The steps and the seconds that a run was trained, as its metrics.jsonl says."""
+    entries = _entries(log)
+    return max(entry["step"] for entry in entries), max(entry.get("seconds", 0.0) for entry in entries)
+
+
 def validations(log: Path) -> list[dict[str, Any]]:
     """The validations in a run's metrics.jsonl, in their order."""
-    entries = [json.loads(line) for line in log.read_text().splitlines()]
-    return [entry for entry in entries if entry.pop("kind") == "validation"]
+    return [entry for entry in _entries(log) if entry.pop("kind") == "validation"]
 
 
 def best_validation(log: Path) -> dict[str, Any]:
@@ -240,3 +298,7 @@ def best_validation(log: Path) -> dict[str, Any]:
     from urrt_jax.training.checkpoints import ranking_loss
 
     return min(validations(log), key=lambda entry: ranking_loss(entry["validation_loss"]), default={})
+
+
+def _entries(log: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in log.read_text().splitlines()]

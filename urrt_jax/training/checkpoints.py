@@ -41,8 +41,8 @@ class Checkpoints:
       keep: how many of the newest checkpoints stay, beside the best one.
 
     Raises:
-      ValueError: the folder holds a run with another configuration (the message lists the fields that differ), its
-        configuration is damaged or missing, or another process is training there.
+      ValueError: the folder holds a run of another method, or with another configuration (the message lists the fields
+        that differ), its configuration is damaged or missing, or another process is training there.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ def _abstract(state: TrainState) -> dict[str, Any]:
 def _agree(path: Path, config: TrainConfig, data: dict[str, Any] | None) -> None:
     """Writes the configuration and the data's fingerprint, or checks them against those already there."""
     # Through JSON and back, so that tuples and lists compare equal.
-    ours = json.loads(json.dumps(dataclasses.asdict(config) | {"data": data}))
+    ours = json.loads(json.dumps(config.as_dict() | {"data": data}))
     if not path.exists():
         checkpoints = path.parent / "checkpoints"
         if checkpoints.is_dir() and any(each.name.isdigit() for each in checkpoints.iterdir()):
@@ -220,6 +220,11 @@ def _agree(path: Path, config: TrainConfig, data: dict[str, Any] | None) -> None
             raise ValueError(f"expected an object, got {type(theirs).__name__}")
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}, which says how the checkpoints beside it were made, is damaged: {error}") from error
+    method = theirs.get("method")
+    if not isinstance(method, dict):
+        raise ValueError(f"{path.parent} holds a run of an earlier version of urrt_jax, which cannot be continued")
+    if method.get("name") != config.method.name:
+        raise ValueError(f"{path.parent} holds a run of the method {method.get('name')!r}, not {config.method.name!r}")
     if data is None:
         ours["data"] = theirs.get("data")
     before, now = _flatten(theirs), _flatten(ours)

@@ -7,6 +7,8 @@ import threading
 import time
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -17,12 +19,12 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from urrt_jax.atomic import write_atomically
-from urrt_jax.checks import check_whole
+from urrt_jax.checks import check_positive, check_whole
 from urrt_jax.data import Shapes
-from urrt_jax.model import Model
 from urrt_jax.training.checkpoints import Checkpoints, ranking_loss
 from urrt_jax.training.state import TrainConfig, TrainState, init_state
 from urrt_jax.training.step import train_steps
+from urrt_jax.training.trainable import Variables
 from urrt_jax.training.validation import validate, validation_pairs
 
 
@@ -35,6 +37,8 @@ class LoopConfig:
       log_every: steps between lines of the log.
       validation_pairs: pairs of each kind in a validation.
       patience: validations without a better one after which training stops; 0 never stops early.
+      minutes: of training in all, stops and continuations included, after which it is validated and stops; they are
+        looked at when a line of the log is written. The learning rate follows ``steps`` all the same. None: no limit.
       keep: newest checkpoints that stay, beside the best.
       progress: whether a progress bar is shown.
     """
@@ -43,11 +47,14 @@ class LoopConfig:
     log_every: int = 50
     validation_pairs: int = 256
     patience: int = 0
+    minutes: float | None = None
     keep: int = 2
     progress: bool = True
 
     def __post_init__(self) -> None:
         check_whole(self, every=1, log_every=1, validation_pairs=1, patience=0, keep=1)
+        if self.minutes is not None:
+            check_positive(self, "minutes")
 
 
 def train(
@@ -57,12 +64,14 @@ def train(
     directory: str | Path,
     *,
     loop: LoopConfig = LoopConfig(),
-) -> Model:
-    """The best model of a run, by validation loss; the run continues where ``directory`` left off.
+) -> Variables:
+    """The best variables of a run, by validation loss; the run continues where ``directory`` left off.
 
-    The folder holds ``config.json``, ``metrics.jsonl`` (one object a line: ``kind`` "train" or "validation", ``step``
-    and the metrics) and ``checkpoints/``. A resumed run is bit-equal to one that was never stopped. Ctrl-C saves first.
-    Where the newest checkpoint is damaged, the run continues from the last whole one, with a warning.
+    The folder holds ``config.json``, ``metrics.jsonl`` (one object a line: ``kind`` "train", "validation" or "stop",
+    ``step`` and the metrics) and ``checkpoints/``. The ``seconds`` of training so far stand in lines of "train" and
+    "stop"; they go on where a run is resumed, and validations do not count. A resumed run is bit-equal to one that was
+    never stopped. Ctrl-C saves first. Where the newest checkpoint is damaged, the run continues from the last whole
+    one, with a warning.
 
     Args:
       config: what is trained; must agree with the folder's.
@@ -72,7 +81,7 @@ def train(
       loop: how it is watched.
 
     Raises:
-      ValueError: the folder holds a run with another configuration or other data, another process is training there,
+      ValueError: the folder holds a run of another method, configuration or data, another process is training there,
         its configuration or all of its checkpoints are damaged, or the intervals do not fit ``steps_per_call``.
       FloatingPointError: a whole interval of steps had non-finite gradients.
       KeyboardInterrupt: on Ctrl-C, after the state was saved.
@@ -95,7 +104,7 @@ def train(
             checkpoints.save(state)
             raise KeyboardInterrupt
         best = checkpoints.restore_best(state)
-        return Model(config.model, jax.device_get((best or state).params))
+        return jax.device_get((best or state).variables)
 
 
 class _Interruption:
@@ -134,54 +143,75 @@ def _run(
 ) -> TrainState:
     """The state at the end of the run, or at the step after which it was interrupted."""
     step = int(state.step)
-    rate, pending, skipped = _Rate(step), None, []
+    clock, pending, skipped = _Clock(step, log.seconds), None, []
     with tqdm(total=config.steps, initial=step, unit="step", disable=not loop.progress, dynamic_ncols=True) as bar:
-        while step < config.steps and not log.stalled(loop.patience) and not interruption.requested:
+        while step < config.steps and not _ended(log, loop) and not interruption.requested:
             state, metrics = train_steps(state, arrays, config)
             step += config.steps_per_call
             # The metrics of the interval before are fetched while this step runs on the device.
             if pending is not None:
-                _report(log, bar, rate, config, *pending)
+                _report(log, bar, clock, config.batch, *pending)
             skipped.append(metrics["skipped"])
             pending = None
             if step % loop.log_every == 0 or step == config.steps:
                 pending = step, metrics | {"skipped": sum(skipped) / len(skipped)}
                 skipped = []
             bar.update(config.steps_per_call)
-            if step % loop.every == 0 or step == config.steps:
+            if step % loop.every == 0 or step == config.steps or _ended(log, loop):
                 if pending is not None:
-                    _report(log, bar, rate, config, *pending)
+                    _report(log, bar, clock, config.batch, *pending)
                     pending = None
-                result = validate(state.params, held_out, config)
-                log.write("validation", step, result)
-                checkpoints.save(state, result["validation_loss"])
+                with clock.stopped():
+                    result = validate(state.variables, held_out, config)
+                    log.write("validation", step, result)
+                    checkpoints.save(state, result["validation_loss"])
                 if loop.progress:
                     bar.write(_sentence(step, result))
-                rate = _Rate(step)
         if pending is not None:
-            _report(log, bar, rate, config, *pending)
+            _report(log, bar, clock, config.batch, *pending)
+        if interruption.requested:
+            jax.block_until_ready(state)
+            log.write("stop", step, {"seconds": clock.seconds})
     return state
 
 
-class _Rate:
-    """Steps a second since the last call, or since it was made."""
-
-    def __init__(self, step: int) -> None:
-        self._step, self._time = step, time.perf_counter()
-
-    def __call__(self, step: int) -> float:
-        before, self._step = self._step, step
-        since, self._time = self._time, time.perf_counter()
-        return (step - before) / (self._time - since)
+def _ended(log: "Log", loop: LoopConfig) -> bool:
+    """Whether training ends before its last step."""
+    return log.stalled(loop.patience) or (loop.minutes is not None and log.seconds >= 60 * loop.minutes)
 
 
-def _report(log: "Log", bar: tqdm, rate: _Rate, config: TrainConfig, step: int, metrics: dict[str, jax.Array]) -> None:
+class _Clock:
+    """How long a run has trained, without its validations, and how fast; ``seconds`` were trained before it began."""
+
+    def __init__(self, step: int, seconds: float) -> None:
+        self._start = time.perf_counter() - seconds
+        self._before = step, seconds
+
+    @property
+    def seconds(self) -> float:
+        """Of training so far."""
+        return time.perf_counter() - self._start
+
+    def rate(self, step: int) -> float:
+        """Steps a second since the last call, or since the clock was made."""
+        (step_before, seconds_before), self._before = self._before, (step, self.seconds)
+        return (step - step_before) / (self._before[1] - seconds_before)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """What is done inside does not count."""
+        start = time.perf_counter()
+        yield
+        self._start += time.perf_counter() - start
+
+
+def _report(log: "Log", bar: tqdm, clock: _Clock, batch: int, step: int, metrics: dict[str, jax.Array]) -> None:
     values = {name: float(value) for name, value in jax.device_get(metrics).items()}
     if values["skipped"] == 1.0:
         raise FloatingPointError(f"every gradient up to step {step} was not finite; lower the learning rate")
-    pairs = rate(step) * config.batch
-    log.write("train", step, values | {"pairs_per_second": round(pairs, 1)})
-    bar.set_postfix(loss=f"{values['loss']:.4f}", chamfer=f"{values['chamfer']:.4f}", pairs_s=f"{pairs:.0f}")
+    pairs = clock.rate(step) * batch
+    log.write("train", step, values | {"pairs_per_second": round(pairs, 1), "seconds": clock.seconds})
+    bar.set_postfix(loss=f"{values['loss']:.4f}", pairs_s=f"{pairs:.0f}")
 
 
 def _sentence(step: int, result: dict[str, float]) -> str:
@@ -222,10 +252,14 @@ class Log:
     """The run's metrics as JSON lines; lines beyond ``step``, from a run that was killed later, are dropped.
 
     Lines that are no entries, as a damaged file has, are dropped with a warning.
+
+    Attributes:
+      seconds: of training so far, as the last line that tells them says.
     """
 
     def __init__(self, path: Path, step: int) -> None:
         self._path = path
+        self.seconds = 0.0
         self._losses: list[float] = []
         kept, foreign = [], []
         lines = path.read_bytes().decode(errors="replace").split("\n") if path.exists() else []
@@ -260,3 +294,5 @@ class Log:
     def _note(self, entry: dict[str, Any]) -> None:
         if entry["kind"] == "validation":
             self._losses.append(ranking_loss(entry["validation_loss"]))
+        if type(entry.get("seconds")) in (int, float):
+            self.seconds = float(entry["seconds"])

@@ -1,5 +1,6 @@
-"""One training step: the unsupervised objective of a batch of pairs, its gradient, one update."""
+"""One training step: the loss of a batch of pairs, its gradient, one update."""
 
+import dataclasses
 import functools
 
 import jax
@@ -8,63 +9,19 @@ import optax
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from urrt_jax import rigid
-from urrt_jax.clouds import first, shift
-from urrt_jax.frames import normalize_pair
-from urrt_jax.losses import chamfer, occupancy_loss, shell_samples
-from urrt_jax.model import Model
-from urrt_jax.model.network import estimate_subsampled
-from urrt_jax.model.partition import branch_logits, occupancy_logits
-from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, corruption_share, make_batch
 from urrt_jax.training.state import TrainConfig, TrainState, optimizer
-
-Metrics = dict[str, Array]
-
-
-def pair_loss(model: Model, pair: Pair, key: Array, config: TrainConfig) -> tuple[Array, Metrics]:
-    """The objective of one pair, (), and its parts: the paper's section 2.4. It never reads ``pair.transform``.
-
-    Alignment is the Chamfer distance between the whole source, moved by the estimate of every step, and the whole
-    target, averaged over the steps; the network itself sees the corrupted clouds. Occupancy is asked of the target.
-    """
-    source, target, frame = normalize_pair(pair.source, pair.target)
-    result = estimate_subsampled(model, source, target)
-
-    whole_source = first(shift(pair.whole_source, frame.source_center, frame.scale), config.loss_points)
-    whole_target = first(shift(pair.whole_target, frame.target_center, frame.scale), config.loss_points)
-
-    def aligned(transform: Rigid) -> Array:
-        moved = whole_source._replace(points=rigid.apply(transform, whole_source.points))
-        return chamfer(moved, whole_target, penalty="distance", scale=config.chamfer_scale)
-
-    alignment = jax.vmap(aligned)(result.steps)
-    metrics = {"chamfer": alignment[-1], "chamfer_first": alignment[0]}
-    loss = jnp.mean(alignment)
-    if config.model.has_regions:
-        if pair.queries is None or pair.inside is None:
-            queries, inside = shell_samples(key, whole_target, config.occupancy_queries)
-        else:
-            rows = jax.random.choice(key, pair.queries.shape[0], (config.occupancy_queries,))
-            queries, inside = (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
-        logits = branch_logits(config.model, model.params["partition"], queries, result.target.embedding)
-        occupancy = occupancy_loss(occupancy_logits(logits), inside)
-        counts = result.target.regions.counts
-        metrics |= {
-            "occupancy": occupancy,
-            "occupancy_accuracy": jnp.mean((occupancy_logits(logits) > 0) == inside),
-            "regions_used": jnp.sum(counts > 0.01 * jnp.sum(counts)).astype(jnp.float32),
-        }
-        loss = loss + config.occupancy_weight * occupancy
-    return loss, {"loss": loss} | metrics
+from urrt_jax.training.trainable import PAIRS, Metrics, Variables
 
 
-def batch_loss(params: dict, batch: Pair, key: Array, config: TrainConfig) -> tuple[Array, Metrics]:
-    """The mean objective of a batch, (), and the means of its parts; ``vmap`` over pairs happens here."""
+def batch_loss(
+    variables: Variables, batch: Pair, key: Array, config: TrainConfig
+) -> tuple[Array, tuple[Metrics, Variables]]:
+    """The mean loss of a batch, (), the means of its parts, and "batch_stats" after it; ``vmap`` over pairs is here."""
     keys = jax.random.split(key, batch.source.points.shape[0])
-    model = Model(config.training_network(), params)
-    losses, metrics = jax.vmap(lambda pair, pair_key: pair_loss(model, pair, pair_key, config))(batch, keys)
-    return jnp.mean(losses), jax.tree.map(jnp.mean, metrics)
+    each = jax.vmap(functools.partial(config.method.loss, variables), axis_name=PAIRS, out_axes=(0, 0, None))
+    losses, metrics, batch_stats = each(batch, keys)
+    return jnp.mean(losses), ({"loss": jnp.mean(losses)} | jax.tree.map(jnp.mean, metrics), batch_stats)
 
 
 def update(state: TrainState, batch: Pair, config: TrainConfig) -> tuple[TrainState, Metrics]:
@@ -73,16 +30,19 @@ def update(state: TrainState, batch: Pair, config: TrainConfig) -> tuple[TrainSt
     A step with a non-finite gradient changes nothing but the step number, and says so in the metric ``skipped``.
     """
     key = jax.random.fold_in(jax.random.key(config.seed + 1), state.step)
-    (_, metrics), gradient = jax.value_and_grad(batch_loss, has_aux=True)(state.params, batch, key, config)
+
+    def objective(params: dict) -> tuple[Array, tuple[Metrics, Variables]]:
+        return batch_loss(dataclasses.replace(state, params=params).variables, batch, key, config)
+
+    (_, (metrics, batch_stats)), gradient = jax.value_and_grad(objective, has_aux=True)(state.params)
     norm = optax.tree.norm(gradient)
     updates, opt_state = optimizer(config).update(gradient, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
+    after = dataclasses.replace(state, params=params, batch_stats=batch_stats, opt_state=opt_state)
     healthy = jnp.isfinite(norm)
-    params, opt_state = jax.tree.map(
-        lambda new, old: jnp.where(healthy, new, old), (params, opt_state), (state.params, state.opt_state)
-    )
+    after = jax.tree.map(lambda new, old: jnp.where(healthy, new, old), after, state)
     metrics |= {"gradient_norm": norm, "skipped": 1.0 - healthy}
-    return TrainState(state.step + 1, params, opt_state), metrics
+    return dataclasses.replace(after, step=state.step + 1), metrics
 
 
 train_step = jax.jit(update, static_argnames="config", donate_argnames="state")
