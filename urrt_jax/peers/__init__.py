@@ -5,6 +5,9 @@ Its library is imported when it is used; the extra ``peers`` installs all but Go
 shapes' bounding sphere; ``OnScans`` brings scans of any unit to it. The settings were chosen among a few on training
 shapes: clean, independently sampled with noise, cropped and with outliers (``experiments/peer_settings``); those of ICP
 from many starts were not.
+
+Learned peers, the networks of other papers, are in ``urrt_jax.peers.learned``: their answers depend on weights, which
+``urrt_jax.peers.learned.weights`` finds, and they take pairs in batches.
 """
 
 from urrt_jax.peers.correspondences import FGR, RANSAC, KISSMatcher

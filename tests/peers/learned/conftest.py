@@ -1,0 +1,81 @@
+"""What tests of learned peers share: files of released weights, training pairs, and a short training."""
+
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from urrt_jax.data.procedural import procedural_shapes
+from urrt_jax.training.pairs import PairConfig, make_batch
+from urrt_jax.training.trainable import PAIRS
+
+
+@pytest.fixture(scope="session")
+def peer_file():
+    """A function of a file's name: its arrays from ``$URRT_DATA/peers``. The test is skipped where it is not there."""
+
+    def read(name: str) -> dict[str, np.ndarray]:
+        path = Path(os.environ.get("URRT_DATA", "nowhere")) / "peers" / name
+        if not path.exists():
+            pytest.skip(f"needs {name}: $URRT_DATA names no folder with peers/{name}")
+        with np.load(path) as arrays:
+            return dict(arrays)
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def clean_batch():
+    """A function of (size, points, seed): clean pairs of procedural shapes, turned by up to 45° about three axes."""
+    shapes = {"points": jnp.asarray(procedural_shapes(8, points=256).points)}
+
+    def make(size: int, points: int, seed: int = 0):
+        return make_batch(jax.random.key(seed), shapes, PairConfig(points=points), size, 0.0)
+
+    return make
+
+
+def _batch_loss(network, variables, batch, key):
+    """The mean loss of a batch, as the training step takes it, and (metrics, "batch_stats")."""
+    keys = jax.random.split(key, batch.source.points.shape[0])
+    losses, metrics, stats = jax.vmap(
+        lambda pair, pair_key: network.loss(variables, pair, pair_key), axis_name=PAIRS, out_axes=(0, 0, None)
+    )(batch, keys)
+    return losses.mean(), (jax.tree.map(lambda values: values.mean(), metrics), stats)
+
+
+@pytest.fixture(scope="session")
+def batch_loss():
+    """A function of (network, variables, batch, key): the mean loss, and (mean metrics, new "batch_stats")."""
+    return _batch_loss
+
+
+@pytest.fixture(scope="session")
+def short_training(clean_batch):
+    """A function of (network, steps): the losses of that many Adam steps, each on a fresh batch of 8 clean pairs."""
+
+    def train(network, steps: int = 60, *, points: int = 48, rate: float = 3e-3) -> np.ndarray:
+        optimizer = optax.adam(rate)
+
+        def step(state, row):
+            variables, moments = state
+            batch, key = clean_batch(8, points, row), jax.random.key(row)
+            stats = variables.get("batch_stats", {})
+
+            def loss(params):
+                return _batch_loss(network, {"params": params, "batch_stats": stats}, batch, key)
+
+            (value, (_, stats)), gradient = jax.value_and_grad(loss, has_aux=True)(variables["params"])
+            updates, moments = optimizer.update(gradient, moments)
+            return ({"params": optax.apply_updates(variables["params"], updates), "batch_stats": stats}, moments), value
+
+        variables = {"batch_stats": {}} | network.init(jax.random.key(0))
+        state = variables, optimizer.init(variables["params"])
+        losses = jax.jit(lambda state: jax.lax.scan(step, state, jnp.arange(steps))[1])(state)
+        return np.asarray(losses)
+
+    return train
