@@ -33,6 +33,9 @@ def test_evaluate_prints_a_table_and_writes_values_beside_json(files, capsys, tm
         (["--protocol", "guess"], "protocol: expected one of"),
         (["--protocol", "drift loud=1"], "options sigma, target_only"),
         (["--methods", "guess"], "method: expected one of"),
+        (["--methods", "dcp_v1"], "set the environment variable URRT_DATA to a folder that holds peers/dcp_v1.npz"),
+        (["--methods", "dcp_v2"], "train it with 'urrt train --method dcp_v2 --out DIR'"),
+        (["--methods", "dcp_v2:nowhere.npz"], "nowhere.npz does not exist"),
         (["--limit", "0"], "limit: expected at least 1"),
         (["--protocol", "scans", "--data", "nowhere.npz"], "nowhere.npz"),
     ],
@@ -41,4 +44,11 @@ def test_evaluate_refuses_what_it_cannot_do_before_any_work(files, capsys, tmp_p
     common = ["--model", str(files["model.npz"]), "--out", str(tmp_path / "results.json")]
     assert cli.main(["evaluate", *common, *flags]) == 2
     assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_evaluate_refuses_a_model_of_ours_as_weights_of_another_network(files, capsys, tmp_path):
+    flags = ["--methods", f"dcp_v2:{files['model.npz']}", "--out", str(tmp_path / "results.json")]
+    assert cli.main(["evaluate", *flags]) == 2
+    assert "model.json is the card of no learned peer" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,8 @@
 """The protocols draw what their definitions say, on every machine, and what they do to a pair is what they claim."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -107,6 +110,42 @@ def test_prnet_keeps_what_is_nearest_to_one_far_place(clouds, item):
         ends = np.sort(sides[-1] * heights)[-768:]
         assert abs(np.mean(sides[-1] * height) - np.mean(ends)) < 2e-3
     assert sides[0] == sides[1]
+
+
+@pytest.mark.parametrize("item", [0, 1, 2])
+def test_prnet_with_three_signs_keeps_what_is_nearest_to_a_place_with_a_sign_for_each_axis(clouds, item):
+    state = np.random.RandomState(item)
+    state.uniform(size=6), state.permutation(1024), state.permutation(1024)
+    place = state.random_sample((1, 3)) + 500.0 * state.choice([1, -1, 1, -1], (1, 3))
+    whole, trial = PROTOCOLS["dcp"](clouds, item).source, find_protocol("prnet signs=3")(clouds, item)
+    order = np.argsort(np.linalg.norm(whole - place, axis=1))[:768]
+    np.testing.assert_array_equal(trial.source, whole[order])
+
+
+def test_prnet_has_one_sign_unless_asked_for_three(clouds):
+    one, default = find_protocol("prnet signs=1")(clouds, 0), PROTOCOLS["prnet"](clouds, 0)
+    np.testing.assert_array_equal(one.source, default.source)
+    assert not np.array_equal(find_protocol("prnet signs=3")(clouds, 0).source, default.source)
+
+
+@pytest.mark.parametrize("signs", [0, 2, 4])
+def test_prnet_refuses_other_numbers_of_signs(clouds, signs):
+    with pytest.raises(ValueError, match=f"signs: expected 1, .*, or 3, .*, got {signs}"):
+        find_protocol(f"prnet signs={signs}")(clouds, 0)
+
+
+def test_prnet_with_three_signs_gives_the_pairs_of_a_published_comparison():
+    """The inputs on which RIENet's released weights were run, of ModelNet40's test set."""
+    data = Path(os.environ.get("URRT_DATA", "nowhere"))
+    paths = data / "modelnet40_test_1024.npz", data / "peers" / "golden_rienet_modelnet.npz"
+    if not all(path.exists() for path in paths):
+        pytest.skip("needs ModelNet40 and peers/golden_rienet_modelnet.npz: URRT_DATA names no folder with them")
+    with np.load(paths[0]) as shapes, np.load(paths[1]) as golden:
+        clouds = shapes["points"]
+        for row, item in enumerate(golden["items"]):
+            trial = find_protocol("prnet signs=3")(clouds, int(item))
+            np.testing.assert_array_equal(trial.source, golden["prnet_source"][row])
+            np.testing.assert_array_equal(trial.target, golden["prnet_target"][row])
 
 
 def test_prnet_noise_is_drawn_as_in_the_released_code(clouds):

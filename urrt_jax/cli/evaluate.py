@@ -33,11 +33,14 @@ class Evaluate:
             a search, and always after a search within 90° (search_all: among all rotations); a model of its own may
             follow, as in network:modelnet40-paper. identity and principal_axes need nothing; icp, icp_identity,
             icp_plane, gicp, fgr, fgr_icp, ransac, ransac_icp, kiss, and on scans scan_icp, scan_fgr, scan_ransac,
-            scan_kiss need 'urrt-jax[peers]'; goicp says how to install it.
+            scan_kiss need 'urrt-jax[peers]'; goicp says how to install it. Learned: dcp_v1, rienet (rienet_unseen,
+            rienet_7scenes, rienet_icl), pointnetlk, pointnetlk_learning3d and pointnetlk_revisited need their released
+            weights in $URRT_DATA/peers; NAME:FILE, as in dcp_v2:runs/dcp_v2/model.npz, has weights that 'urrt train
+            --method NAME' wrote.
         model: Ours: name of a packaged model, or a file written by 'urrt train'.
         limit: At most so many items, evenly spread.
         points: Points of each shape.
-        batch: Pairs at once, for ours.
+        batch: Pairs at once, for ours and learned methods; 32 by default, or fewer where the network is large.
         out: Where to write the results.
     """
 
@@ -48,7 +51,7 @@ class Evaluate:
     model: str = "modelnet40"
     limit: int | None = None
     points: int = 1024
-    batch: int = 64
+    batch: int | None = None
     out: Path = Path("results.json")
 
     def run(self) -> int:
@@ -83,7 +86,7 @@ class Evaluate:
         self.out.parent.mkdir(parents=True, exist_ok=True)
         figures, failures = {}, {}
         if sys.stderr.isatty() and any(method.batch > 1 for method in methods.values()):
-            note("our methods compile at their first batch, unless an earlier run kept the programs")
+            note("methods that take batches compile at the first one, unless an earlier run kept the programs")
         for name, method in methods.items():
             save = values_path(self.out.parent / "items", name, method, self.protocol, pairs, items)
             save.parent.mkdir(exist_ok=True)

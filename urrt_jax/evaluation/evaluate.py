@@ -18,7 +18,8 @@ from jax import Array
 from tqdm import tqdm
 
 from urrt_jax.atomic import write_atomically
-from urrt_jax.evaluation.methods import Method, Ours, Poses, find_method
+from urrt_jax.evaluation.interface import InBatches, Method, Poses
+from urrt_jax.evaluation.methods import find_method
 from urrt_jax.evaluation.metrics import clean_chamfer, pose_errors, summarize, true_overlap
 from urrt_jax.evaluation.protocols import Trial, find_protocol
 from urrt_jax.rigid import Rigid
@@ -162,10 +163,10 @@ def evaluate(
 ) -> Evaluation:
     """The evaluation of a method over the items of a protocol.
 
-    Our methods run in batches, others pair by pair. An item on which the method raises, or gives values that are
-    not finite, is scored as the identity and listed in ``failures``. With ``save`` the values are kept in a ``.npz``
-    all along, also when the run is interrupted, and the same call continues after the last item there. Where that file
-    can't be read, it is renamed, and all items are evaluated anew, with a warning.
+    Our methods and learned peers run in batches, others pair by pair. An item on which the method raises, or gives
+    values that are not finite, is scored as the identity and listed in ``failures``. With ``save`` the values are kept
+    in a ``.npz`` all along, also when the run is interrupted, and the same call continues after the last item there.
+    Where that file can't be read, it is renamed, and all items are evaluated anew, with a warning.
 
     Args:
       method: a name as ``find_method`` takes it, a ``Model``, or a function from a source (N, 3)
@@ -180,7 +181,7 @@ def evaluate(
 
     Raises:
       ValueError: an unknown method or protocol, no items, items out of range, or ``save`` holds another evaluation.
-      ImportError: the method needs a library that is not installed; the message says how to install it.
+      ImportError: the method needs a library or weights that are not there; the message says how to get them.
     """
     method, make = find_method(method), find_protocol(protocol)
     _check_data(protocol, data)
@@ -204,8 +205,8 @@ def evaluate(
         parts, kept = [before], len(before)
     done = kept
 
-    if batch is not None and isinstance(method, Ours):
-        method = dataclasses.replace(method, batch=batch)
+    if isinstance(method, InBatches):
+        method = method.for_pairs(len(chosen), batch)
     size = min(method.batch if batch is None else batch, len(chosen))
     saved = time.monotonic()
     try:

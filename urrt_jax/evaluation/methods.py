@@ -1,23 +1,24 @@
-"""What can be evaluated: our network, alone and refined, in batches; peers and plain functions, pair by pair."""
+"""What can be evaluated: our network, alone and refined, and learned peers, in batches; the others pair by pair."""
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal
 
-import jax
 import numpy as np
 
 from urrt_jax.batches import register_pairs
+from urrt_jax.evaluation.interface import InBatches, Method, Poses
+from urrt_jax.evaluation.learned import find_learned
 from urrt_jax.model import Model
 from urrt_jax.peers import PEERS, Peer
+from urrt_jax.peers.learned.weights import NETWORKS, RELEASED
 from urrt_jax.refine import ICP
 from urrt_jax.result import Outcome
 from urrt_jax.search import Search
 from urrt_jax.weights import load_model
+from urrt_jax.weights.files import digest
 
-_BATCH = 32  # pairs: on a CPU, twice as many leave its caches and take an eighth longer each
 # What each of ours is told (``Ours``).
 _OURS: dict[str, dict[str, Any]] = {
     "network": {"refine": None},
@@ -29,43 +30,8 @@ _OURS: dict[str, dict[str, Any]] = {
 }
 
 
-class Poses(NamedTuple):
-    """The answers for B pairs: (B, 3, 3), (B, 3), and what the method says of them, NaN where it says nothing."""
-
-    rotation: np.ndarray
-    translation: np.ndarray
-    fitness: np.ndarray
-    converged: np.ndarray
-
-
-class Method(Protocol):
-    """A registration method as ``evaluate`` runs it.
-
-    One with an attribute ``informed`` that is true is also told what is known of the poses: ``align`` then takes
-    ``expected``, of every trial.
-    """
-
-    @property
-    def title(self) -> str:
-        """How tables call it."""
-        ...
-
-    @property
-    def batch(self) -> int:
-        """How many pairs it takes at once, at most."""
-        ...
-
-    def identity(self) -> dict[str, Any]:
-        """Everything that its answers depend on, for results files; ImportError where its library is missing."""
-        ...
-
-    def align(self, sources: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> Poses:
-        """The poses of B pairs of clouds (N, 3) and (M, 3)."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Ours:
+class Ours(InBatches):
     """``register_pairs`` with a model, refined or the network alone.
 
     Attributes:
@@ -74,7 +40,6 @@ class Ours:
       search: as for ``register``.
       informed: whether it begins at the rotation that the protocol expects (``Trial.expected``).
       name: of the model, for titles.
-      batch: pairs at once.
     """
 
     model: Model
@@ -82,7 +47,6 @@ class Ours:
     search: Search | Literal["auto"] | None = "auto"
     informed: bool = False
     name: str = "model"
-    batch: int = _BATCH
 
     @property
     def title(self) -> str:
@@ -97,7 +61,7 @@ class Ours:
     def identity(self) -> dict[str, Any]:
         return {
             "method": "register",
-            "parameters_sha256": _digest(self.model),
+            "parameters_sha256": digest(self.model.params),
             "config": dataclasses.asdict(self.model.config),
             "refine": _plain(self.refine),
             "search": None if self.refine is None and self.search == "auto" else _plain(self.search),
@@ -175,11 +139,13 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
         it is by default, without a search, and always after a search over rotations up to 90°, which hold the
         protocols' own (``"search_all"``: over all rotations, for scans; ``"search_near"``: about the middle of the
         protocol's own, which learned methods know from training); a model of its own may follow, as in
-        ``"network:modelnet40-paper"``; the others are the names in ``PEERS``.
+        ``"network:modelnet40-paper"``. Learned peers are the names in ``RELEASED``, with weights that the method reads
+        when it is used, and ``"NAME:FILE"`` for a name in ``NETWORKS``, with weights that ``urrt train`` wrote. The
+        others are the names in ``PEERS``.
       model: what ours uses where the name says nothing of it: a packaged name or a file.
 
     Raises:
-      ValueError: there is no such method or model.
+      ValueError: there is no such method or model, or the file holds no weights of that network.
     """
     if isinstance(method, Model):
         return Ours(model=method)
@@ -190,9 +156,14 @@ def find_method(method: "str | Method | Model | Peer | Callable", *, model: str 
         if stages in _OURS and bool(colon) == bool(own):
             used = own or model
             return Ours(model=load_model(used), name=_short_name(used), **_OURS[stages])
+        if stages in NETWORKS | RELEASED and bool(colon) == bool(own):
+            return find_learned(stages, own or None)
         if method not in PEERS:
-            ours, others = ", ".join(_OURS), ", ".join(PEERS)
-            raise ValueError(f"method: expected one of {ours} (or one with :MODEL), {others}, got {method!r}")
+            ours, learned, others = map(", ".join, (_OURS, RELEASED | NETWORKS, PEERS))
+            raise ValueError(
+                f"method: expected one of {ours} (or one with :MODEL), {learned} (a network's name may have :FILE), "
+                f"{others}, got {method!r}"
+            )
         return find_method(PEERS[method])
     if hasattr(method, "align"):
         return method  # type: ignore[return-value]
@@ -206,13 +177,6 @@ def _short_name(model: str | Path) -> str:
     """What titles call a model: the name of its run, where training wrote "model.npz"."""
     path = Path(model)
     return path.parent.name if path.stem == "model" and path.parent.name else path.stem
-
-
-def _digest(model: Model) -> str:
-    state = hashlib.sha256()
-    for leaf in jax.tree.leaves(model.params):
-        state.update(np.ascontiguousarray(leaf).tobytes())
-    return state.hexdigest()
 
 
 def _plain(options: Any) -> Any:

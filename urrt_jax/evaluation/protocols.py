@@ -78,14 +78,17 @@ def dcp(clouds: np.ndarray, item: int, *, points: int = 1024) -> Trial:
     return pair.trial()
 
 
-def prnet(clouds: np.ndarray, item: int, *, noise: bool = False, kept: int = KEPT) -> Trial:
+def prnet(clouds: np.ndarray, item: int, *, noise: bool = False, kept: int = KEPT, signs: int = 1) -> Trial:
     """PRNet's partial pair (Wang and Solomon 2019): both clouds lose what is far from one common place.
 
     After DCP's draws, with ``noise`` both clouds drift independently. The place is ``rand(1, 3)`` plus 500 or minus
-    500 on all three axes at once, as in the released code; each cloud keeps its ``kept`` nearest points, in order of
-    distance. The place is the same in both frames, so the crops nearly agree.
+    500 on all three axes at once, as in the released code, or with ``signs=3`` on each axis by itself, as in some
+    published comparisons; each cloud keeps its ``kept`` nearest points, in order of distance. The place is the same in
+    both frames, so the crops nearly agree.
     """
     _check_kept(kept, clouds)
+    if signs not in (1, 3):
+        raise ValueError(f"signs: expected 1, for all three axes, or 3, one for each, got {signs}")
     pair, random = _dcp_pair(clouds, item)
     # The released code adds noise to the float32 source in place and to a float64 target.
     source, target = pair.source.astype(np.float32), pair.target
@@ -95,7 +98,7 @@ def prnet(clouds: np.ndarray, item: int, *, noise: bool = False, kept: int = KEP
             cloud + np.clip(SIGMA * random.randn(3, len(cloud)), -CLIP, CLIP).T for cloud in (source, target)
         )
         source = source.astype(np.float32)
-    place = random.random_sample((1, 3)) + 500.0 * random.choice([1, -1, 1, -1])
+    place = random.random_sample((1, 3)) + 500.0 * random.choice([1, -1, 1, -1], (1, signs))
     source, target = (cloud[nearest_rows(cloud, place, kept)] for cloud in (source, target))
     return pair.trial(source, target)
 
