@@ -2,7 +2,7 @@
 
     python experiments/summary.py
 
-writes `summary_short.md`, `summary_recalls.md`, `summary_paper.md` and `summary_scans.md` beside this file;
+writes `summary_short.md`, `summary_recalls.md`, `summary_paper.md`, `summary_scans.md` and `summary_learned.md` here;
 `python -m experiments.pages` then puts them into the pages. Imports neither JAX nor urrt_jax.
 """
 
@@ -169,7 +169,38 @@ def real_scans() -> list[str]:
     return lines
 
 
-TABLES = {"short": short, "recalls": recalls, "paper": against_the_paper, "scans": real_scans}
+def learned() -> list[str]:
+    """All against all: recall and MAE(R) of every method on every protocol, its parameters and its time."""
+    parts, networks = load("learned")["parts"], json.loads((HERE / "benchmarks" / "networks.json").read_text())
+    costs = {row["name"]: row for row in networks["rows"]}
+    heads = [part["title"] for part in parts]
+    lines = ["| recall, MAE(R) | " + " | ".join(heads) + " | ms a pair | parameters |"]
+    lines.append("|---|" + "---:|" * (len(heads) + 2))
+    rows = [measured(part) for part in parts]
+    best = [max(f"{row['recall_5deg_0.1']:.2f}" for row in each.values()) for each in rows]
+    for name in dict.fromkeys(name for each in rows for name in each):
+        cells = []
+        for each, top in zip(rows, best, strict=True):
+            if name not in each:
+                cells.append("–")
+                continue
+            recall = f"{each[name]['recall_5deg_0.1']:.2f}"
+            cells.append(f"{f'**{recall}**' if recall == top else recall}, {each[name]['mae_rotation']:.1f}°")
+        cost = costs.get(name.partition(":")[0], {})
+        time, size = cost.get("milliseconds_a_pair"), cost.get("parameters")
+        cells += ["–" if time is None else f"{time:,.0f}", "–" if size is None else f"{size:,}"]
+        title = next(each[name]["title"] for each in rows if name in each)
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    return lines
+
+
+TABLES = {
+    "short": short,
+    "recalls": recalls,
+    "paper": against_the_paper,
+    "scans": real_scans,
+    "learned": learned,
+}
 """What draws each table, `summary_NAME.md`, line by line."""
 
 if __name__ == "__main__":

@@ -207,11 +207,12 @@ def test_rows_of_something_else_are_not_kept(measured, files, change, message):
 def test_a_row_that_the_earlier_results_lack_is_measured(measured, files):
     experiment, out = measured
     results = json.loads((out / "results.json").read_text())
-    del results["parts"][0]["rows"][1], results["parts"][1]
+    del results["parts"][0]["rows"][1]
     (out / "results.json").write_text(json.dumps(results))
-    rows = [part["rows"] for part in run(experiment, files, out, only=["register"])["parts"]]
+    wider = dataclasses.replace(experiment, parts=(*experiment.parts, Part(title="new", protocol="drift", points=100)))
+    rows = [part["rows"] for part in run(wider, files, out, only=["register"])["parts"]]
     assert [row["mae_rotation"] == 123.0 for row in rows[0]] == [True, False, False]
-    assert len(rows[1]) == 3
+    assert [row["method"] for row in rows[1]] == ["identity", "principal_axes", "register"]
 
 
 def test_a_part_may_be_of_the_first_items(experiment, files, tmp_path):

@@ -1,0 +1,97 @@
+"""The page of learned methods: what it says is what was measured, and networks give what their authors' code gave."""
+
+import json
+
+import pytest
+
+from experiments.summary import HERE, find_part, load, measured
+
+PAGE = " ".join((HERE / "learned" / "README.md").read_text().split())
+RESULTS = load("learned")
+PARITY = json.loads((HERE / "learned" / "parity.json").read_text())["rows"]
+WITH_COUNTERPARTS = ("dcp", "incomplete", "incomplete_both", "outliers", "prnet")
+OURS = ("network", "plain", "register")
+
+
+def _recall(protocol: str, method: str) -> float:
+    return measured(find_part(RESULTS, protocol))[method]["recall_5deg_0.1"]
+
+
+def _mae(protocol: str, method: str) -> float:
+    return measured(find_part(RESULTS, protocol))[method]["mae_rotation"]
+
+
+def _mse(method: str) -> float:
+    return measured(find_part(RESULTS, "dcp"))[method]["mse_rotation"]
+
+
+def _least(method: str) -> float:
+    return min(measured(part)[method]["recall_5deg_0.1"] for part in RESULTS["parts"])
+
+
+_LK = ("pointnetlk", "pointnetlk_revisited")
+STATEMENTS = (
+    f"it finds {_recall('incomplete_both', 'rienet'):.2f} of the pairs, where `register` finds "
+    f"{_recall('incomplete_both', 'register'):.2f}",
+    f"{_recall('drift', 'rienet'):.2f} of the pairs with noise (P.D.), and "
+    f"{_recall('independent', 'rienet'):.2f} of the independent samples",
+    f"There it finds {_recall('dcp', 'dcp_v1'):.2f} of the pairs",
+    f"MAE(R) is {_mae('drift', 'dcp_v1'):.1f}° under noise, {_mae('incomplete', 'dcp_v1'):.1f}° where the source is "
+    f"cropped and {_mae('outliers', 'dcp_v1'):.1f}° with outliers",
+    f"({_recall('independent', _LK[0]):.2f} and {_recall('dcp', _LK[0]):.2f}; Revisited "
+    f"{_recall('independent', _LK[1]):.2f} and {_recall('dcp', _LK[1]):.2f})",
+    "at most {:.2f} of the pairs of D.I. and D.O.".format(
+        max(_recall(protocol, name) for protocol in ("incomplete", "incomplete_both", "outliers") for name in _LK)
+    ),
+    f"at least {_least('network'):.2f}. Refined, it finds at least {_least('plain'):.2f}. RANSAC with ICP finds "
+    f"at least {_least('ransac_icp'):.2f}",
+    f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
+)
+
+
+@pytest.mark.parametrize("statement", STATEMENTS)
+def test_page_says_what_was_measured(statement):
+    assert statement in PAGE
+
+
+@pytest.mark.parametrize("method", ["rienet", "ransac_icp"])
+def test_methods_that_find_every_pair_with_counterparts(method):
+    assert {_recall(protocol, method) for protocol in WITH_COUNTERPARTS} == {1.0}
+
+
+def test_only_ours_finds_most_pairs_of_every_protocol():
+    names = measured(RESULTS["parts"][0])
+    assert [name for name in names if _least(name) >= 0.75] == list(OURS)
+    assert [name for name in names if _least(name) >= 0.65] == ["ransac_icp", *OURS]
+
+
+def _apart(row: dict) -> float:
+    """By what share MSE(R) or MAE(R) differ from the authors' code, the larger one; 0 beyond the digits on record."""
+    gaps = []
+    for name, digit in (("mse_rotation", 1e-4), ("mae_rotation", 1e-5)):
+        here, authors = row["here"][name], row["authors"][name]
+        gaps.append(0.0 if abs(here - authors) < digit else abs(here - authors) / authors)
+    return max(gaps)
+
+
+OTHER_PAIRS = ("outliers", "independent")
+SAME = [row for row in PARITY if row["protocol"] not in OTHER_PAIRS]
+
+
+def test_rows_that_agree_with_the_authors_code():
+    agree = [row for row in PARITY if _apart(row) <= 0.02]
+    assert f"**{len(agree)} of the {len(PARITY)} rows agree within 2 %" in PAGE
+    assert {row["protocol"] for row in agree} == {"dcp", "drift", "prnet", "prnet signs=3", "incomplete"}
+    assert all(row in agree for row in PARITY if row["protocol"] == "dcp")
+    assert sum(row not in agree for row in PARITY if row["protocol"] in ("drift", "prnet", "prnet signs=3")) == 2
+
+
+def test_rows_that_disagree_are_of_networks_that_fail():
+    apart = [row for row in SAME if _apart(row) > 0.02]
+    gaps = {
+        name: max(abs(row["here"][name] / row["authors"][name] - 1) for row in apart)
+        for name in ("mse_rotation", "mae_rotation")
+    }
+    assert f"by at most {100 * gaps['mae_rotation']:.1f} %, and MSE(R)" in PAGE
+    assert f"by at most {100 * gaps['mse_rotation']:.1f} %. Those" in PAGE
+    assert min(row["authors"]["mae_rotation"] for row in apart) > 20
