@@ -39,6 +39,18 @@ def clean_batch():
     return make
 
 
+@pytest.fixture(scope="module")
+def batch(clean_batch):
+    """Three clean pairs of 24 points."""
+    return clean_batch(3, 24)
+
+
+@pytest.fixture(scope="module")
+def pair(batch):
+    """The first of them."""
+    return jax.tree.map(lambda values: values[0], batch)
+
+
 def _batch_loss(network, variables, batch, key):
     """The mean loss of a batch, as the training step takes it, and (metrics, "batch_stats")."""
     keys = jax.random.split(key, batch.source.points.shape[0])

@@ -191,16 +191,6 @@ def estimate(network):
     return jax.jit(network.estimate)
 
 
-@pytest.fixture(scope="module")
-def batch(clean_batch):
-    return clean_batch(3, 24)
-
-
-@pytest.fixture(scope="module")
-def pair(batch):
-    return jax.tree.map(lambda values: values[0], batch)
-
-
 def _assert_same(found, expected, atol=2e-5):
     np.testing.assert_allclose(found.rotation, expected.rotation, atol=atol)
     np.testing.assert_allclose(found.translation, expected.translation, atol=atol)

@@ -44,16 +44,6 @@ def variables():
     return jax.tree.unflatten(form, draw)
 
 
-@pytest.fixture(scope="module")
-def batch(clean_batch):
-    return clean_batch(3, 24)
-
-
-@pytest.fixture(scope="module")
-def pair(batch):
-    return jax.tree.map(lambda values: values[0], batch)
-
-
 def test_parameters_are_as_many_as_published():
     fresh = jax.eval_shape(PRNet().init, _KEY)["params"]
     # The published count includes ten numbers that are no parameters: a constant reflection and an unused temperature.

@@ -1,1 +1,1 @@
-"""Learned peers: the networks of other papers in Flax, with their losses and their authors' released weights."""
+"""Learned peers: the networks of other papers in Flax, with their losses, and readers of their released weights."""

@@ -14,7 +14,7 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
 from urrt_jax.peers.learned import release
 from urrt_jax.peers.learned.graph import EdgeConvolutions, neighbor_edges
-from urrt_jax.peers.learned.matching import soft_matches, soft_targets
+from urrt_jax.peers.learned.matching import scaled_products, soft_matches, soft_targets
 from urrt_jax.peers.learned.network import Network, pose_loss
 from urrt_jax.peers.learned.transformer import Transformer
 from urrt_jax.rigid import Rigid
@@ -86,12 +86,9 @@ class DCP(Network):
         """
         if self.attention:
             return super().from_release(arrays)
+        names = [(f"emb_nn.conv{row}", f"emb_nn.bn{row}") for row in range(1, len(self.widths) + 2)]
         inputs = (6, *self.widths[:-1], sum(self.widths))
-        params: dict[str, Any] = {}
-        stats: dict[str, Any] = {}
-        for row, widths in enumerate(zip(inputs, (*self.widths, self.width), strict=True)):
-            names = f"emb_nn.conv{row + 1}", f"emb_nn.bn{row + 1}"
-            params[f"Layer_{row}"], stats[f"Layer_{row}"] = release.layer(arrays, *names, widths)
+        params, stats = release.stack(arrays, names, inputs, (*self.widths, self.width))
         return {"params": {"convolutions": params}, "batch_stats": {"convolutions": stats}}
 
 
@@ -136,9 +133,7 @@ def match(features: tuple[Array, Array], target_mask: Array) -> Array:
       features: (N, C) of the source and (M, C) of the target.
       target_mask: (M,) bool, the real target points.
     """
-    source, target = features
-    products = jnp.matmul(source, target.T, precision=jax.lax.Precision.HIGHEST)
-    return soft_matches(products / jnp.sqrt(source.shape[-1]), target_mask)
+    return soft_matches(scaled_products(*features), target_mask)
 
 
 def align(matches: Array, source: Cloud, target: Cloud) -> Rigid:

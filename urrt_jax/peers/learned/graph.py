@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax.clouds import Cloud
+from urrt_jax.neighbors import k_nearest
 from urrt_jax.peers.learned.layers import Layer, masked_max
 
 
@@ -20,12 +22,12 @@ def neighbor_rows(features: Array, mask: Array, k: int) -> Array:
       mask: (N,) bool.
       k: at most N.
     """
+    if features.shape[1] == 3:
+        return k_nearest(features, Cloud(features, mask), k, batch_size=None).index
     fixed = jax.lax.stop_gradient(features)
-    if features.shape[1] <= 3:
-        squared = sum((fixed[:, None, i] - fixed[None, :, i]) ** 2 for i in range(features.shape[1]))
-    else:  # differences of so many channels would take too long
-        norms = jnp.sum(fixed**2, axis=1)
-        squared = norms[:, None] + norms - 2 * jnp.matmul(fixed, fixed.T, precision=jax.lax.Precision.HIGHEST)
+    # Differences of so many channels would take too long.
+    norms = jnp.sum(fixed**2, axis=1)
+    squared = norms[:, None] + norms - 2 * jnp.matmul(fixed, fixed.T, precision=jax.lax.Precision.HIGHEST)
     return jax.lax.top_k(jnp.where(mask[None, :], -squared, -jnp.inf), k)[1]
 
 

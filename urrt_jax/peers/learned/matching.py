@@ -7,6 +7,11 @@ from jax import Array
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
+def scaled_products(source: Array, target: Array) -> Array:
+    """The products over √C, (N, M), of features (N, C) and (M, C): the logits of attention."""
+    return jnp.matmul(source, target.T, precision=_HIGHEST) / jnp.sqrt(source.shape[-1])
+
+
 def soft_matches(logits: Array, mask: Array) -> Array:
     """Softmax over the real target points: (N, M), rows add to 1.
 

@@ -153,11 +153,7 @@ class PointNetLK(Network):
         return self._read(arrays, names)
 
     def _read(self, arrays: Mapping[str, np.ndarray], names: list[tuple[str, str]]) -> Variables:
-        params: dict[str, Any] = {}
-        stats: dict[str, Any] = {}
-        widths = zip((3, *self.widths[:-1]), self.widths, strict=True)
-        for row, (pair, sizes) in enumerate(zip(names, widths, strict=True)):
-            params[f"Layer_{row}"], stats[f"Layer_{row}"] = release.layer(arrays, *pair, sizes, bias=True)
+        params, stats = release.stack(arrays, names, (3, *self.widths[:-1]), self.widths, bias=True)
         return {"params": params, "batch_stats": stats}
 
 

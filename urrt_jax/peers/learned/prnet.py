@@ -13,7 +13,7 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
 from urrt_jax.peers.learned.graph import neighbor_edges
 from urrt_jax.peers.learned.layers import Layer, masked_max
-from urrt_jax.peers.learned.matching import hard_matches, soft_targets
+from urrt_jax.peers.learned.matching import hard_matches, scaled_products, soft_targets
 from urrt_jax.peers.learned.network import Network, pose_loss
 from urrt_jax.peers.learned.transformer import Transformer
 from urrt_jax.rigid import Rigid
@@ -154,8 +154,7 @@ def align(features: Matchable, key: Array) -> Pass:
     """The transforms from hard matches of the keypoints, drawn for both directions, all keypoints weighing the same."""
 
     def one_way(key: Array, source: Keypoints, target: Keypoints) -> Rigid:
-        products = jnp.matmul(source.features, target.features.T, precision=jax.lax.Precision.HIGHEST)
-        logits = products / jnp.sqrt(source.features.shape[-1])
+        logits = scaled_products(source.features, target.features)
         matches = hard_matches(key, logits, target.cloud.mask, features.temperature)
         counterparts = soft_targets(matches, target.cloud.points)
         return rigid.procrustes(source.cloud.points, counterparts, source.cloud.mask.astype(counterparts.dtype))

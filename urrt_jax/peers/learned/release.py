@@ -1,6 +1,6 @@
 """Reads the arrays of a released network, named as PyTorch names them, into the variables of our layers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -84,3 +84,29 @@ def layer(
     params, stats = norm(arrays, bn, widths[1])
     linear = dense(arrays, conv, widths, bias=bias)
     return {"Dense_0": linear, "BatchNorm_0": params}, {"BatchNorm_0": stats}
+
+
+def stack(
+    arrays: Mapping[str, np.ndarray],
+    names: Sequence[tuple[str, str]],
+    inputs: Sequence[int],
+    widths: Sequence[int],
+    *,
+    bias: bool = False,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The "params" and "batch_stats" of a module whose ``Layer``s are all that it has: "Layer_0", "Layer_1", ….
+
+    Args:
+      arrays: flat names to arrays.
+      names: of the linear map and the batch norm of each layer, as for ``layer``.
+      inputs: C_in of each layer.
+      widths: C_out of each layer.
+      bias: whether the linear maps have one.
+
+    Raises:
+      ValueError: an array is missing or has another shape.
+    """
+    sizes = zip(inputs, widths, strict=True)
+    layers = [layer(arrays, *pair, size, bias=bias) for pair, size in zip(names, sizes, strict=True)]
+    params, stats = ({f"Layer_{row}": each[which] for row, each in enumerate(layers)} for which in (0, 1))
+    return params, stats

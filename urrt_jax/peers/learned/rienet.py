@@ -127,11 +127,9 @@ class RIENet(Network):
           ValueError: an array is missing or has another shape.
         """
         layer = functools.partial(release.layer, arrays, bias=True)
+        names = [(f"emb_nn.model.conv{row}", f"emb_nn.model.bn{row}") for row in range(1, len(self.widths) + 2)]
         inputs = (3, *self.widths[:-1], sum(self.widths))
-        convolutions = {
-            f"Layer_{row}": release.layer(arrays, f"emb_nn.model.conv{row + 1}", f"emb_nn.model.bn{row + 1}", widths)
-            for row, widths in enumerate(zip(inputs, (*self.widths, self.width), strict=True))
-        }
+        convolutions = release.stack(arrays, names, inputs, (*self.widths, self.width))
         prefix, wide, attention = "forwards.weight_function.model", 2 * self.hidden, inliers.ATTENTION
         weights = {
             "first": _convolution(arrays, f"{prefix}1.0", f"{prefix}1.1", (3, self.hidden)),
@@ -141,9 +139,8 @@ class RIENet(Network):
         for name, number in (("values", 2), ("scores", 3)):
             weights[f"{name}_0"] = layer(f"{prefix}{number}.0", f"{prefix}{number}.1", (wide, attention))
             weights[f"{name}_1"] = layer(f"{prefix}{number}.3", f"{prefix}{number}.4", (attention, attention))
-        modules = {"convolutions": convolutions, "inliers": weights}
         params, stats = (
-            {module: {name: pair[which] for name, pair in layers.items()} for module, layers in modules.items()}
+            {"convolutions": convolutions[which], "inliers": {name: pair[which] for name, pair in weights.items()}}
             for which in (0, 1)
         )
         params["inliers"]["output"] = release.dense(arrays, f"{prefix}4.3", (inliers.LAST, 1))

@@ -18,7 +18,7 @@ from urrt_jax.peers.learned.deepgmr import DeepGMR
 from urrt_jax.peers.learned.network import Network
 from urrt_jax.peers.learned.pointnetlk import PointNetLK, PointNetLKRevisited
 from urrt_jax.peers.learned.prnet import PRNet
-from urrt_jax.peers.learned.rienet import RIENet
+from urrt_jax.peers.learned.rienet import RELEASES, RIENet
 from urrt_jax.peers.learned.rpmnet import RPMNet
 from urrt_jax.training.trainable import Variables
 from urrt_jax.weights import files
@@ -70,19 +70,19 @@ RELEASED: dict[str, Release] = {
         trained_on="ModelNet40, clean pairs",
     ),
     "rienet": _RIENET(
-        network=RIENet(), file="rienet_modelnet.npz", note="released weights, trained without noise",
+        network=RELEASES["modelnet"], file="rienet_modelnet.npz", note="released weights, trained without noise",
         trained_on="ModelNet40, PRNet's crops without noise",
     ),
     "rienet_unseen": _RIENET(
-        network=RIENet(hidden=16), file="rienet_unseen.npz", note="released weights, trained on 20 categories",
+        network=RELEASES["unseen"], file="rienet_unseen.npz", note="released weights, trained on 20 categories",
         trained_on="the first 20 categories of ModelNet40, PRNet's crops without noise",
     ),
     "rienet_7scenes": _RIENET(
-        network=RIENet(margin=0.5, neighbors=8, match_neighbors=8), file="rienet_7scenes.npz",
+        network=RELEASES["7scenes"], file="rienet_7scenes.npz",
         note="released weights, trained on 7Scenes", trained_on="7Scenes",
     ),
     "rienet_icl": _RIENET(
-        network=RIENet(hidden=16, margin=0.5, neighbors=32, match_neighbors=10), file="rienet_icl.npz",
+        network=RELEASES["icl"], file="rienet_icl.npz",
         note="released weights, trained on ICL-NUIM", trained_on="ICL-NUIM",
     ),
     "pointnetlk": _SARODE(
