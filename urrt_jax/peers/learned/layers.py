@@ -33,32 +33,23 @@ class BatchNorm(nn.Module):
         stored_mean = self.variable("batch_stats", "mean", jnp.zeros, width)
         stored_variance = self.variable("batch_stats", "variance", jnp.ones, width)
         mean, variance = stored_mean.value, stored_variance.value
-        if not training:
-            return (features - mean) * jax.lax.rsqrt(variance + _EPSILON) * scale + bias
-        mask = jnp.broadcast_to(mask.reshape(mask.shape + (1,) * (features.ndim - 1 - mask.ndim)), features.shape[:-1])
-        weight, rows = mask.reshape(-1).astype(features.dtype), features.reshape(-1, *width)
+        if training:
+            mask = mask.reshape(mask.shape + (1,) * (features.ndim - 1 - mask.ndim))
+            weight = jnp.broadcast_to(mask, features.shape[:-1]).reshape(-1).astype(features.dtype)
+            rows = features.reshape(-1, *width)
 
-        def total(values: Array) -> Array:
-            return jax.lax.psum(jnp.matmul(weight, values, precision=jax.lax.Precision.HIGHEST), PAIRS)
+            def total(values: Array) -> Array:
+                # As a product: the CPU takes several times as long to reduce so many rows.
+                return jax.lax.psum(jnp.matmul(weight, values, precision=jax.lax.Precision.HIGHEST), PAIRS)
 
-        count = jnp.maximum(jax.lax.psum(jnp.sum(weight), PAIRS), 1.0)
-        mean = total(rows) / count
-        centred = rows - _repeat(mean, len(rows))
-        # The variance does not change with the mean in the first order, so its derivative need not be taken.
-        variance = total((rows - jax.lax.stop_gradient(mean)) ** 2) / count
-        unbiased = variance * count / jnp.maximum(count - 1.0, 1.0)
-        stored_mean.value += _MOMENTUM * (jax.lax.stop_gradient(mean) - stored_mean.value)
-        stored_variance.value += _MOMENTUM * (jax.lax.stop_gradient(unbiased) - stored_variance.value)
-        normalised = centred * _repeat(jax.lax.rsqrt(variance + _EPSILON) * scale, len(rows)) + _repeat(bias, len(rows))
-        return normalised.reshape(features.shape)
-
-
-def _repeat(row: Array, count: int) -> Array:
-    """A row (C,), ``count`` times: (count, C).
-
-    As a product, so that its derivative is one too: a sum over rows, which the CPU takes ten times as long to reduce.
-    """
-    return jnp.matmul(jnp.ones((count, 1), row.dtype), row[None], precision=jax.lax.Precision.HIGHEST)
+            count = jnp.maximum(jax.lax.psum(jnp.sum(weight), PAIRS), 1.0)
+            mean = total(rows) / count
+            # The variance does not change with the mean in the first order, so its derivative need not be taken.
+            variance = total((rows - jax.lax.stop_gradient(mean)) ** 2) / count
+            unbiased = variance * count / jnp.maximum(count - 1.0, 1.0)
+            stored_mean.value += _MOMENTUM * (jax.lax.stop_gradient(mean) - stored_mean.value)
+            stored_variance.value += _MOMENTUM * (jax.lax.stop_gradient(unbiased) - stored_variance.value)
+        return (features - mean) * jax.lax.rsqrt(variance + _EPSILON) * scale + bias
 
 
 class Layer(nn.Module):
