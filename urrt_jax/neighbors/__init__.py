@@ -9,6 +9,7 @@ from urrt_jax.neighbors.nearest import (
     k_nearest,
     nearest,
     spacing,
+    top_rows,
 )
 
 __all__ = [
@@ -21,4 +22,5 @@ __all__ = [
     "make_blocks",
     "nearest",
     "spacing",
+    "top_rows",
 ]

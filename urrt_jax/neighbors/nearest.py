@@ -144,7 +144,7 @@ def k_nearest(query: Array, reference: Cloud, k: int, *, batch_size: int | None 
 
     def one(point: Array) -> Array:
         squared = sum((point[i] - anchors[:, i]) ** 2 for i in range(3))
-        return jax.lax.top_k(-squared, k)[1]
+        return top_rows(-squared, k)
 
     fixed = jax.lax.stop_gradient(query)
     if batch_size is None:
@@ -153,6 +153,20 @@ def k_nearest(query: Array, reference: Cloud, k: int, *, batch_size: int | None 
         index = jax.lax.map(one, fixed, batch_size=min(batch_size, max(1, query.shape[0])))
     squared = jnp.sum((query[:, None] - reference.points[index]) ** 2, axis=-1)
     return Neighbors(index, jnp.where(reference.mask[index], squared, jnp.inf))
+
+
+def top_rows(values: Array, k: int) -> Array:
+    """Where the k largest values of every row are, largest first and the first of equals first: (..., k).
+
+    No derivative passes.
+
+    Args:
+      values: (..., M), float32.
+      k: at most M.
+    """
+    rows = jax.lax.top_k(jax.lax.stop_gradient(values), k)[1]
+    # Without the barrier the compiler merges a slice of the rows with the selection, and the CPU sorts all M instead.
+    return jax.lax.optimization_barrier(rows)
 
 
 def coarser_spacing(source: Cloud, target: Cloud) -> Array:

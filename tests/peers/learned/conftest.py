@@ -1,4 +1,4 @@
-"""What tests of learned peers share: files of released weights, training pairs, and a short training."""
+"""What tests of learned peers share: files of released weights, and training pairs with their loss."""
 
 import os
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from urrt_jax.data.procedural import procedural_shapes
@@ -64,30 +63,3 @@ def _batch_loss(network, variables, batch, key):
 def batch_loss():
     """A function of (network, variables, batch, key): the mean loss, and (mean metrics, new "batch_stats")."""
     return _batch_loss
-
-
-@pytest.fixture(scope="session")
-def short_training(clean_batch):
-    """A function of (network, steps): the losses of that many Adam steps, each on a fresh batch of 8 clean pairs."""
-
-    def train(network, steps: int = 60, *, points: int = 48, rate: float = 3e-3) -> np.ndarray:
-        optimizer = optax.adam(rate)
-
-        def step(state, row):
-            variables, moments = state
-            batch, key = clean_batch(8, points, row), jax.random.key(row)
-            stats = variables.get("batch_stats", {})
-
-            def loss(params):
-                return _batch_loss(network, {"params": params, "batch_stats": stats}, batch, key)
-
-            (value, (_, stats)), gradient = jax.value_and_grad(loss, has_aux=True)(variables["params"])
-            updates, moments = optimizer.update(gradient, moments)
-            return ({"params": optax.apply_updates(variables["params"], updates), "batch_stats": stats}, moments), value
-
-        variables = {"batch_stats": {}} | network.init(jax.random.key(0))
-        state = variables, optimizer.init(variables["params"])
-        losses = jax.jit(lambda state: jax.lax.scan(step, state, jnp.arange(steps))[1])(state)
-        return np.asarray(losses)
-
-    return train

@@ -13,7 +13,6 @@ from urrt_jax.clouds import Cloud, centroid, make_cloud
 from urrt_jax.data.procedural import procedural_shapes
 from urrt_jax.peers.learned.deepgmr import DeepGMR, align, mixture
 from urrt_jax.peers.learned.invariants import centred_features
-from urrt_jax.peers.learned.network import estimate_batch
 from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, PairConfig, make_batch
 from urrt_jax.training.trainable import PAIRS
@@ -155,13 +154,6 @@ def test_empty_component_does_not_move_the_pose(cloud):
     source, target, pose = _turned(cloud, 30)
     shares = jax.nn.one_hot(np.arange(len(cloud)) % 5, 6)
     _assert_same(align(mixture(source, shares), mixture(target, shares)), pose, atol=1e-4)
-
-
-def test_batch_gives_what_its_pairs_give_alone(variables, pairs):
-    batch = estimate_batch(_NETWORK, variables, pairs.source, pairs.target, _KEY)
-    for i in range(3):
-        pair = _at(i, pairs)
-        _assert_same(_at(i, batch), _estimate(variables, pair.source, pair.target, _KEY), atol=1e-8)
 
 
 def test_derivative_agrees_with_finite_differences_along_a_direction(variables, pairs):

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from urrt_jax.data.procedural import procedural_shapes
+from urrt_jax.peers.learned.network import estimate_batch
 from urrt_jax.peers.learned.weights import NETWORKS
-from urrt_jax.training.pairs import PairConfig
+from urrt_jax.training.pairs import PairConfig, make_batch
 from urrt_jax.training.state import TrainConfig, init_state
-from urrt_jax.training.step import train_steps
+from urrt_jax.training.step import train_step
 
 _DCP = dict(widths=(8,), width=8, neighbors=4, heads=2, hidden=8)
 _SMALL = {
@@ -29,26 +30,39 @@ _SMALL = {
 """Settings that make every network small: what it has several of, as layers and passes, it has once or twice."""
 
 
+_PAIRS = PairConfig(points=32, outliers=0.0)
+
+
 @pytest.fixture(scope="module")
-def shapes():
-    return {"points": jnp.asarray(procedural_shapes(4, points=32).points)}
+def batch():
+    """Four pairs with noise and crops."""
+    shapes = {"points": jnp.asarray(procedural_shapes(4, points=32).points)}
+    return jax.jit(make_batch, static_argnums=(2, 3))(jax.random.key(0), shapes, _PAIRS, 4, 1.0)
 
 
 @pytest.fixture(scope="module", params=NETWORKS)
-def training(request, shapes):
-    """The states before and after four steps, and the steps' mean metrics."""
+def network(request):
+    return dataclasses.replace(NETWORKS[request.param], **_SMALL[request.param])
+
+
+@pytest.fixture(scope="module")
+def training(network, batch):
+    """The states before and after twenty steps on one batch, and the metrics of every step."""
     config = TrainConfig(
-        method=dataclasses.replace(NETWORKS[request.param], **_SMALL[request.param]),
-        pairs=PairConfig(points=32, corrupted=1.0, ramp_share=0.0),
-        steps=4,
-        steps_per_call=4,
+        method=network,
+        pairs=_PAIRS,
+        steps=20,
+        learning_rate=1e-2,
         batch=4,
         warmup=0,
         weight_decay=0.0,  # so that only a derivative can change a weight
     )
     before = jax.device_get(init_state(config))
-    after, metrics = train_steps(jax.device_put(before), shapes, config)
-    return before, jax.device_get(after), metrics
+    state, metrics = jax.device_put(before), []
+    for _ in range(config.steps):
+        state, of_step = train_step(state, batch, config)
+        metrics.append(of_step)
+    return before, jax.device_get(state), jax.device_get(metrics)
 
 
 def _unchanged(before, after):
@@ -57,10 +71,17 @@ def _unchanged(before, after):
     return [jax.tree_util.keystr(path) for path, equal in jax.tree_util.tree_leaves_with_path(same) if equal]
 
 
-def test_loss_is_finite_and_no_step_is_skipped(training):
+def test_no_step_is_skipped(training):
     _, _, metrics = training
-    assert np.isfinite(metrics["loss"])
-    assert metrics["skipped"] == 0
+    assert all(np.isfinite(each["loss"]) and each["skipped"] == 0 for each in metrics)
+
+
+def test_loss_of_the_batch_falls(network, training):
+    if network.name.startswith("pointnetlk"):
+        pytest.skip("its loss rises before it falls: see test_pointnetlk.py")
+    _, _, metrics = training
+    losses = [each["loss"] for each in metrics]
+    assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
 
 
 def test_every_parameter_is_trained(training):
@@ -71,3 +92,18 @@ def test_every_parameter_is_trained(training):
 def test_every_statistic_of_batch_norm_is_updated(training):
     before, after, _ = training
     assert _unchanged(before.batch_stats, after.batch_stats) == []
+
+
+def test_a_batch_gives_what_its_pairs_give_alone(network, training, batch, x64):
+    _, after, _ = training
+    variables, clouds = jax.tree.map(
+        lambda values: values.astype(x64) if values.dtype == jnp.float32 else values,
+        (after.variables, (batch.source, batch.target)),
+    )
+    together = estimate_batch(network, variables, *clouds, jax.random.key(0))
+    alone = jax.jit(network.estimate)
+    for row in range(4):
+        pair, expected = jax.tree.map(lambda values, row=row: values[row], (clouds, together))
+        found = alone(variables, *pair, jax.random.key(0))
+        np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-8)
+        np.testing.assert_allclose(found.translation, expected.translation, atol=1e-8)

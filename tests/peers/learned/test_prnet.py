@@ -9,7 +9,6 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
 from urrt_jax.peers.learned import prnet
 from urrt_jax.peers.learned.matching import hard_matches, soft_matches
-from urrt_jax.peers.learned.network import estimate_batch
 from urrt_jax.peers.learned.prnet import Keypoints, Matchable, Pass, PRNet
 from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import euler_rotation
@@ -177,15 +176,6 @@ def test_order_of_points_changes_nothing(variables, pair):
 def test_another_key_draws_other_matches(variables, pair):
     found = [_estimate(variables, pair.source, pair.target, jax.random.key(seed)) for seed in (0, 1)]
     assert rigid.rotation_angle(found[0].rotation, found[1].rotation) > 1e-3
-
-
-def test_a_batch_is_a_loop_of_its_pairs_with_the_same_key(variables, batch):
-    together = estimate_batch(_NETWORK, variables, batch.source, batch.target, _KEY)
-    for row in range(3):
-        source, target, expected = jax.tree.map(
-            lambda values, row=row: values[row], (batch.source, batch.target, together)
-        )
-        _assert_same(_estimate(variables, source, target, _KEY), expected)
 
 
 @pytest.fixture(scope="module")

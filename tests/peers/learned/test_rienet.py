@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, make_cloud
-from urrt_jax.peers.learned.network import estimate_batch
 from urrt_jax.peers.learned.rienet import RELEASES, RIENet
 from urrt_jax.peers.learned.rienet_loss import alignment_loss, consensus_loss, keypoints, match_loss
 from urrt_jax.peers.learned.rienet_passes import feature_distance, sum_over_neighbors, total
@@ -243,15 +242,6 @@ def test_moving_a_cloud_moves_the_answer(variables, which, x64):
     _assert_same(_estimate(variables, *map(make_cloud, clouds)), Rigid(plain.rotation, moved), 1e-10)
 
 
-def test_a_batch_gives_what_pairs_give_one_by_one(variables, clean_batch, x64):
-    batch = _as_double(clean_batch(3, 40))
-    found = estimate_batch(_SMALL, variables, batch.source, batch.target, _KEY)
-    for row in range(3):
-        pair = jax.tree.map(lambda leaf: leaf[row], batch)  # noqa: B023 - used at once
-        one = _estimate(variables, pair.source, pair.target)
-        _assert_same(jax.tree.map(lambda leaf: leaf[row], found), one, 1e-10)  # noqa: B023 - used at once
-
-
 def test_matches_between_neighbors_are_summed(x64):
     rng = np.random.default_rng(0)
     match, rows, columns = rng.uniform(size=(7, 5)), rng.integers(0, 7, (7, 3)), rng.integers(0, 5, (5, 2))
@@ -379,8 +369,3 @@ def test_checkpoints_are_chosen_without_labels(variables, clean_batch):
     loss, found = jax.jit(_SMALL.evaluate)(variables, unknown, _KEY)
     assert np.isfinite(loss)
     _assert_same(found, _estimate(variables, pair.source, pair.target), 1e-5)
-
-
-def test_loss_falls_in_a_short_training(short_training):
-    losses = short_training(_SMALL, 120, rate=1e-2)
-    assert losses[-8:].mean() < 0.7 * losses[:8].mean()

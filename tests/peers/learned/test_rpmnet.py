@@ -8,7 +8,6 @@ import pytest
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, make_cloud
 from urrt_jax.data.procedural import procedural_shapes
-from urrt_jax.peers.learned.network import estimate_batch
 from urrt_jax.peers.learned.rpmnet import RPMNet
 from urrt_jax.training.pairs import PairConfig, make_batch
 
@@ -88,13 +87,6 @@ def test_order_of_points_changes_nothing_with_few_neighbours(variables, pairs, w
     expected = _estimate(variables, *clouds.values(), _KEY)
     clouds[which] = make_cloud(clouds[which].points[rows])
     _assert_same(_estimate(variables, *clouds.values(), _KEY), expected, atol=1e-8)
-
-
-def test_batch_gives_what_its_pairs_give_alone(variables, pairs):
-    batch = estimate_batch(_NETWORK, variables, pairs.source, pairs.target, _KEY)
-    for i in range(3):
-        pair = _pair(pairs, i)
-        _assert_same(_pair(batch, i), _estimate(variables, pair.source, pair.target, _KEY), atol=1e-8)
 
 
 def test_source_is_moved_to_where_the_target_is(variables, pairs):

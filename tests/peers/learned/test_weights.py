@@ -146,8 +146,10 @@ def test_settings_for_results_say_what_answers_depend_on(saved):
     [
         ({}, "Small (trained here)"),
         ({"seconds": None}, "Small (trained here)"),
-        ({"seconds": 2520.0}, "Small (trained here: 0.7 h)"),
-        ({"seconds": 2520.0, "training": {"pairs": {"points": 512}}}, "Small (trained here: 512 points, 0.7 h)"),
+        ({"seconds": 2520.0}, "Small (trained here: 42 min)"),
+        ({"seconds": 4320.0, "training": {"pairs": {"points": 512}}}, "Small (trained here: 512 points, 1.2 h)"),
+        ({"steps": 500, "training": {"batch": 16}}, "Small (trained here: 8,000 pairs)"),
+        ({"steps": 500, "training": {}}, "Small (trained here)"),
         ({"training": {"pairs": 512}}, "Small (trained here)"),
     ],
 )

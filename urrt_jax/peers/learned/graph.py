@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud
-from urrt_jax.neighbors import k_nearest
+from urrt_jax.neighbors import k_nearest, top_rows
 from urrt_jax.peers.learned.layers import Layer, masked_max
 
 
@@ -28,7 +28,7 @@ def neighbor_rows(features: Array, mask: Array, k: int) -> Array:
     # Differences of so many channels would take too long.
     norms = jnp.sum(fixed**2, axis=1)
     squared = norms[:, None] + norms - 2 * jnp.matmul(fixed, fixed.T, precision=jax.lax.Precision.HIGHEST)
-    return jax.lax.top_k(jnp.where(mask[None, :], -squared, -jnp.inf), k)[1]
+    return top_rows(jnp.where(mask[None, :], -squared, -jnp.inf), k)
 
 
 def neighbor_edges(features: Array, mask: Array, k: int) -> tuple[Array, Array]:

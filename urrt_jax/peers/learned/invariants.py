@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from urrt_jax.neighbors import top_rows
 from urrt_jax.peers.learned.graph import neighbor_rows
 from urrt_jax.rigid import cross, normalize
 
@@ -25,8 +26,8 @@ def rows_within(points: Array, mask: Array, radius: float, k: int) -> Array:
     squared = sum((points[:, None, i] - points[None, :, i]) ** 2 for i in range(3))
     near = mask[None, :] & (squared <= radius**2) & (own[:, None] != own[None, :])
     # Indices as float32, because the CPU selects the largest of those in much less time than of integers.
-    first, rows = jax.lax.top_k(jnp.where(near, -own.astype(jnp.float32), -jnp.inf), min(k, count))
-    rows = jnp.where(jnp.isfinite(first), rows, own[:, None])
+    rows = top_rows(jnp.where(near, -own.astype(jnp.float32), -jnp.inf), min(k, count))
+    rows = jnp.where(jnp.take_along_axis(near, rows, axis=1), rows, own[:, None])
     return jnp.concatenate([rows, jnp.broadcast_to(own[:, None], (count, k - rows.shape[1]))], axis=1)
 
 

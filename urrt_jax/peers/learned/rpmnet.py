@@ -12,7 +12,7 @@ from jax import Array
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, centroid, normals
 from urrt_jax.peers.learned.invariants import point_pair_features, rows_within
-from urrt_jax.peers.learned.layers import masked_max
+from urrt_jax.peers.learned.layers import GroupNorm, masked_max
 from urrt_jax.peers.learned.matching import soft_targets
 from urrt_jax.peers.learned.network import Network
 from urrt_jax.peers.learned.sinkhorn import sinkhorn
@@ -21,7 +21,7 @@ from urrt_jax.training.pairs import Pair
 from urrt_jax.training.trainable import Metrics, Variables
 
 _HIGHEST = jax.lax.Precision.HIGHEST
-_EPSILON = 1e-5  # of group norm, PyTorch's default; and, chosen here, of match masses
+_EPSILON = 1e-5  # of match masses, chosen here
 _MASS_WEIGHT, _DISCOUNT = 0.01, 0.5  # of the loss: of the match mass, and of each pass before the last
 
 
@@ -183,27 +183,8 @@ class _Annealing(nn.Module):
 def _layers(widths: Sequence[int], groups: int, features: Array, mask: Array) -> Array:
     """Linear maps, each followed by group norm and ReLU; to be called within a compact module."""
     for width in widths:
-        features = nn.relu(_GroupNorm(groups)(nn.Dense(width)(features), mask))
+        features = nn.relu(GroupNorm(groups)(nn.Dense(width)(features), mask))
     return features
-
-
-class _GroupNorm(nn.Module):
-    """Group norm (Wu and He 2018) over the real rows of one cloud. Flax's wants the mask repeated for every channel."""
-
-    groups: int
-
-    @nn.compact
-    def __call__(self, features: Array, mask: Array) -> Array:
-        """Normalised features (..., C); ``mask`` may lack trailing axes, which are then real throughout."""
-        width = features.shape[-1]
-        scale = self.param("scale", nn.initializers.ones, (width,))
-        bias = self.param("bias", nn.initializers.zeros, (width,))
-        grouped = features.reshape(*features.shape[:-1], self.groups, width // self.groups)
-        axes = (*range(features.ndim - 1), features.ndim)
-        real = mask.reshape(mask.shape + (1,) * (grouped.ndim - mask.ndim))
-        mean = jnp.mean(grouped, axes, keepdims=True, where=real)
-        variance = jnp.mean((grouped - mean) ** 2, axes, keepdims=True, where=real)
-        return ((grouped - mean) * jax.lax.rsqrt(variance + _EPSILON)).reshape(features.shape) * scale + bias
 
 
 def _masked_mean(values: Array, mask: Array) -> Array:

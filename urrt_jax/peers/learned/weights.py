@@ -213,13 +213,17 @@ def _stored(key: str) -> type:
 
 def _title(network: Network, card: dict[str, Any]) -> str:
     """The title of a network that was trained by the loop of this project, as far as its card tells."""
-    facts = []
     training = card.get("training")
-    pairs = training.get("pairs") if isinstance(training, dict) else None
+    training = training if isinstance(training, dict) else {}
+    pairs = training.get("pairs")
+    steps, batch = card.get("steps"), training.get("batch")
+    facts = []
     if isinstance(pairs, dict) and isinstance(pairs.get("points"), int):
         facts.append(f"{pairs['points']} points")
-    if isinstance(card.get("seconds"), int | float):
-        facts.append(f"{card['seconds'] / 3600:.1f} h")
+    if isinstance(steps, int) and isinstance(batch, int):
+        facts.insert(0, f"{steps * batch:,} pairs")
+    if isinstance(seconds := card.get("seconds"), int | float):
+        facts.append(f"{seconds / 60:.0f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h")
     return f"{network.title} (trained here{': ' if facts else ''}{', '.join(facts)})"
 
 
