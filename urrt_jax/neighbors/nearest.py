@@ -143,8 +143,8 @@ def k_nearest(query: Array, reference: Cloud, k: int, *, batch_size: int | None 
     anchors = jax.lax.stop_gradient(jnp.where(reference.mask[:, None], reference.points, jnp.inf))
 
     def one(point: Array) -> Array:
-        squared = sum((point[i] - anchors[:, i]) ** 2 for i in range(3))
-        return top_rows(-squared, k)
+        x, y, z = ((point[i] - anchors[:, i]) ** 2 for i in range(3))
+        return top_rows(-(x + y + z), k)
 
     fixed = jax.lax.stop_gradient(query)
     if batch_size is None:
