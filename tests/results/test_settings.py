@@ -7,10 +7,12 @@ import dataclasses
 import json
 import runpy
 import shlex
+from pathlib import Path
 
 import pytest
 import tyro
 
+from experiments.learned.train import RATES, flags
 from experiments.summary import HERE, load
 from urrt_jax import available_models, load_model, model_card
 from urrt_jax.cli.train import Train
@@ -73,3 +75,10 @@ def test_neighbour_search_in_use_is_the_fastest_of_those_in_jax():
     for row in json.loads((HERE / "benchmarks/neighbors.json").read_text())["rows"]:
         times = {method: time for method, time in row["milliseconds"].items() if method != "SciPy"}
         assert min(times, key=times.__getitem__) == ("point by point" if row["points"] <= LARGE else "blocks")
+
+
+@pytest.mark.parametrize("name", RATES)
+def test_learned_peers_were_trained_by_the_command_of_their_page(name):
+    card = json.loads((HERE / "learned" / "weights" / f"{name}.json").read_text())
+    assert json.loads(json.dumps(flags(name, "modelnet40", Path(), 8).config().as_dict())) == card["training"]
+    assert (HERE / "learned" / "weights" / f"{name}.npz").stat().st_size <= 12e6
