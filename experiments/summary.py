@@ -2,8 +2,8 @@
 
     python experiments/summary.py
 
-writes `summary_short.md`, `summary_recalls.md`, `summary_paper.md`, `summary_scans.md` and `summary_learned.md` here;
-`python -m experiments.pages` then puts them into the pages. Imports neither JAX nor urrt_jax.
+writes a `summary_NAME.md` here for every table of `TABLES`, which `python -m experiments.pages` then puts into the pages.
+Imports neither JAX nor urrt_jax.
 """
 
 import json
@@ -194,12 +194,40 @@ def learned() -> list[str]:
     return lines
 
 
+def trained() -> list[str]:
+    """Learned methods on clean pairs, trained here and with released weights, beside the paper's figures."""
+    (part,) = (part for part in load("table3_comparison")["parts"] if part["title"].endswith("learned methods"))
+    rows, networks = measured(part), json.loads((HERE / "benchmarks" / "networks.json").read_text())
+    paper = {name.removesuffix(" (paper)"): values for name, values in part["published"].items()}
+    lines = [
+        "| MSE(R), MAE(R) | pairs seen | trained here | released weights | the paper |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for network in networks["rows"]:
+        own = next((row for name, row in rows.items() if name.startswith(f"{network['name']}:experiments")), None)
+        if own is None:
+            continue
+        released, published = rows.get(network["name"]), paper.get(network["method"])
+        cells = [_both(own["mse_rotation"], own["mae_rotation"])]
+        cells.append("–" if released is None else _both(released["mse_rotation"], released["mae_rotation"]))
+        cells.append("–" if published is None else _both(*published[:2]))
+        card = json.loads((HERE / "learned" / "weights" / f"{network['name']}.json").read_text())
+        seen = card["steps"] * card["training"]["batch"]
+        lines.append(f"| {network['method']} | {seen:,} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _both(mse: float, mae: float) -> str:
+    return f"{mse:.2f}, {mae:.3f}°"
+
+
 TABLES = {
     "short": short,
     "recalls": recalls,
     "paper": against_the_paper,
     "scans": real_scans,
     "learned": learned,
+    "trained": trained,
 }
 """What draws each table, `summary_NAME.md`, line by line."""
 

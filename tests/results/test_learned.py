@@ -29,6 +29,17 @@ def _least(method: str) -> float:
     return min(measured(part)[method]["recall_5deg_0.1"] for part in RESULTS["parts"])
 
 
+(TRAINED,) = (part for part in load("table3_comparison")["parts"] if part["title"].endswith("learned methods"))
+PAPER = {name.removesuffix(" (paper)"): values for name, values in TRAINED["published"].items()}
+
+
+def _clean(name: str, value: str = "mae_rotation") -> float:
+    """Of the clean pairs of table 3, where ``NAME:`` stands for the weights that were trained here."""
+    weights = f"{name}experiments/learned/weights/{name[:-1]}.npz" if name.endswith(":") else name
+    return measured(TRAINED)[weights][value]
+
+
+_COORDINATES = [_clean(f"{name}:") for name in ("dcp_v1", "dcp_v2", "prnet", "pointnetlk", "pointnetlk_revisited")]
 _LK = ("pointnetlk", "pointnetlk_revisited")
 STATEMENTS = (
     f"it finds {_recall('incomplete_both', 'rienet'):.2f} of the pairs, where `register` finds "
@@ -46,12 +57,26 @@ STATEMENTS = (
     f"at least {_least('network'):.2f}. Refined, it finds at least {_least('plain'):.2f}. RANSAC with ICP finds "
     f"at least {_least('ransac_icp'):.2f}",
     f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
+    f"MAE(R) of {_clean('rienet:'):.3f}° and {_clean('deepgmr:'):.3f}°, RPM-Net {_clean('rpmnet:'):.2f}°",
+    f"are still at {min(_COORDINATES):.1f}° to {max(_COORDINATES):.1f}°",
+    f"behind both DCPs and RPM-Net (MAE(R) {PAPER['DeepGMR'][1]:.3f}°)",
+    f"has a MAE(R) of {_clean('rpmnet:'):.3f}°, DCPv1's released weights {_clean('dcp_v1'):.3f}°",
+    f"DCPv1 is better ({_clean('dcp_v1', 'mse_rotation'):.1f} and {_clean('rpmnet:', 'mse_rotation'):.1f})",
 )
 
 
 @pytest.mark.parametrize("statement", STATEMENTS)
 def test_page_says_what_was_measured(statement):
     assert statement in PAGE
+
+
+def test_deepgmr_trained_here_is_before_those_that_the_paper_has_before_it():
+    before = ("DCPv1", "DCPv2", "RPM-Net")
+    assert all(PAPER["DeepGMR"][place] > PAPER[name][place] for name in before for place in (0, 1))
+    for value in ("mse_rotation", "mae_rotation"):
+        assert _clean("deepgmr:", value) < min(
+            _clean(name, value) for name in ("dcp_v1", "dcp_v1:", "dcp_v2:", "rpmnet:", "prnet:")
+        )
 
 
 @pytest.mark.parametrize("method", ["rienet", "ransac_icp"])
