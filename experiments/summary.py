@@ -2,8 +2,8 @@
 
     python experiments/summary.py
 
-writes a `summary_NAME.md` here for every table of `TABLES`, which `python -m experiments.pages` then puts into the pages.
-Imports neither JAX nor urrt_jax.
+writes a `summary_NAME.md` here for every table of `TABLES`, which
+`python -m experiments.pages` then puts into the pages. Imports neither JAX nor urrt_jax.
 """
 
 import json
