@@ -67,7 +67,8 @@ STATEMENTS = (
     f"MAE(R) of {_clean('rienet:'):.3f}° and {_clean('deepgmr:'):.3f}°, RPM-Net {_clean('rpmnet:'):.2f}°",
     f"trained here it finds {_rienet('drift', True):.2f} of the pairs, the released weights, which never saw noise, "
     f"{_rienet('drift', False):.2f}",
-    f"After so short a training on D.O. it finds {_rienet('outliers', True):.2f}, they find {_rienet('outliers', False):.2f}",
+    f"After so short a training on D.O. it finds {_rienet('outliers', True):.2f}, they find "
+    f"{_rienet('outliers', False):.2f}",
     f"are still at {min(_COORDINATES):.1f}° to {max(_COORDINATES):.1f}°",
     f"behind both DCPs and RPM-Net (MAE(R) {PAPER['DeepGMR'][1]:.3f}°)",
     f"has a MAE(R) of {_clean('rpmnet:'):.3f}°, DCPv1's released weights {_clean('dcp_v1'):.3f}°",
