@@ -1,5 +1,7 @@
 """RPM-Net: the published size, and what must not matter (padding, order, batches) does not."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -120,6 +122,20 @@ def test_derivative_agrees_with_finite_differences_along_a_direction(variables, 
     step = 1e-6
     expected = (along(step) - along(-step)) / (2 * step)
     np.testing.assert_allclose(sum(jax.tree.leaves(derivatives)), expected, rtol=1e-5)
+
+
+def test_forward_derivative_of_the_estimate_agrees_with_finite_differences(variables, pairs):
+    pair = _pair(pairs)
+    # Of one pass: no derivative goes from one to the next.
+    estimate = jax.jit(dataclasses.replace(_NETWORK, passes=1).estimate)
+
+    def along(step):
+        moved = jax.tree.map(lambda leaf: leaf * (1 + step), variables)
+        return estimate(moved, pair.source, pair.target, _KEY).translation
+
+    step = 1e-6
+    _, slope = jax.jvp(along, (0.0,), (1.0,))
+    np.testing.assert_allclose(slope, (along(step) - along(-step)) / (2 * step), rtol=1e-4, atol=1e-7)
 
 
 def test_true_pose_has_no_distance(variables, pairs):

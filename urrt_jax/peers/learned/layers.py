@@ -77,7 +77,8 @@ class GroupNorm(nn.Module):
         # The variance does not change with the mean in the first order, so its derivative need not be taken.
         variance = mean_of((rows - jax.lax.stop_gradient(mean)) ** 2)
         factor = jax.lax.rsqrt(variance + _EPSILON) * scale
-        return _scaled(rows, weight, mean, factor, bias).reshape(features.shape)
+        # Not _scaled, which has no forward-mode derivative: estimates are made with this norm, too.
+        return ((rows - mean) * factor + bias).reshape(features.shape)
 
 
 def _rows(features: Array, mask: Array) -> tuple[Array, Array]:
