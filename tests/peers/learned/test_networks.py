@@ -33,11 +33,15 @@ _SMALL = {
 _PAIRS = PairConfig(points=32, outliers=0.0)
 
 
-@pytest.fixture(scope="module")
-def batch():
-    """Four pairs with noise and crops."""
+def _batch(spoiled: float):
+    """Four pairs, of which this share has noise and crops."""
     shapes = {"points": jnp.asarray(procedural_shapes(4, points=32).points)}
-    return jax.jit(make_batch, static_argnums=(2, 3))(jax.random.key(0), shapes, _PAIRS, 4, 1.0)
+    return jax.jit(make_batch, static_argnums=(2, 3))(jax.random.key(0), shapes, _PAIRS, 4, spoiled)
+
+
+@pytest.fixture(scope="module")
+def spoiled():
+    return _batch(1.0)
 
 
 @pytest.fixture(scope="module", params=NETWORKS)
@@ -46,20 +50,22 @@ def network(request):
 
 
 @pytest.fixture(scope="module")
-def training(network, batch):
-    """The states before and after twenty steps on one batch, and the metrics of every step."""
+def training(network, spoiled):
+    """The states before and after sixty steps on one batch and one on spoiled pairs, and the metrics of every step."""
+    # PRNet draws its matches: of spoiled pairs its loss falls too unevenly for so few steps.
+    clean = network.name == "prnet"
     config = TrainConfig(
         method=network,
         pairs=_PAIRS,
-        steps=20,
-        learning_rate=1e-2,
+        steps=61,
+        learning_rate=3e-3 if clean else 1e-2,
         batch=4,
         warmup=0,
         weight_decay=0.0,  # so that only a derivative can change a weight
     )
     before = jax.device_get(init_state(config))
     state, metrics = jax.device_put(before), []
-    for _ in range(config.steps):
+    for batch in [_batch(0.0) if clean else spoiled] * 60 + [spoiled]:
         state, of_step = train_step(state, batch, config)
         metrics.append(of_step)
     return before, jax.device_get(state), jax.device_get(metrics)
@@ -80,8 +86,8 @@ def test_loss_of_the_batch_falls(network, training):
     if network.name.startswith("pointnetlk"):
         pytest.skip("its loss rises before it falls: see test_pointnetlk.py")
     _, _, metrics = training
-    losses = [each["loss"] for each in metrics]
-    assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
+    losses = [each["loss"] for each in metrics[:60]]
+    assert np.mean(losses[-3:]) < 0.7 * np.mean(losses[:3])
 
 
 def test_every_parameter_is_trained(training):
@@ -94,11 +100,11 @@ def test_every_statistic_of_batch_norm_is_updated(training):
     assert _unchanged(before.batch_stats, after.batch_stats) == []
 
 
-def test_a_batch_gives_what_its_pairs_give_alone(network, training, batch, x64):
+def test_a_batch_gives_what_its_pairs_give_alone(network, training, spoiled, x64):
     _, after, _ = training
     variables, clouds = jax.tree.map(
         lambda values: values.astype(x64) if values.dtype == jnp.float32 else values,
-        (after.variables, (batch.source, batch.target)),
+        (after.variables, (spoiled.source, spoiled.target)),
     )
     together = estimate_batch(network, variables, *clouds, jax.random.key(0))
     alone = jax.jit(network.estimate)
