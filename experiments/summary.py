@@ -2,8 +2,8 @@
 
     python experiments/summary.py
 
-writes a `summary_NAME.md` here for every table of `TABLES`, which
-`python -m experiments.pages` then puts into the pages. Imports neither JAX nor urrt_jax.
+writes a `summary_NAME.md` here for every table of `TABLES`; `python -m experiments.pages` then puts them into the
+pages. Imports neither JAX nor urrt_jax.
 """
 
 import json
@@ -204,7 +204,7 @@ def trained() -> list[str]:
         "|---|---:|---:|---:|---:|",
     ]
     for network in networks["rows"]:
-        own = next((row for name, row in rows.items() if name.startswith(f"{network['name']}:experiments")), None)
+        own = rows.get(f"{network['name']}:experiments/learned/weights/{network['name']}.npz")
         if own is None:
             continue
         released, published = rows.get(network["name"]), paper.get(network["method"])

@@ -2,9 +2,9 @@
 
     python experiments/learned/train.py --data PATH
 
-This is a short training, for two CPU cores; `--minutes 600` is a longer one. A run that was stopped goes on with the
-same command. Runs are kept in runs/learned; weights and their cards are written to the folder `weights` beside this
-file.
+This is a short training, for two CPU cores; `--minutes 600 --out runs/long` is a longer one. A run that was stopped
+goes on with the same command; other minutes need another folder. Weights and their cards are written to the folder
+`weights` beside this file, where they replace those of the run before.
 """
 
 import argparse
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--data", required=True, help="as for `urrt train --data`")
     parser.add_argument("--methods", nargs="+", choices=RATES, default=list(RATES), help="by default all of them")
     parser.add_argument("--minutes", type=float, default=8, help="of training, for each method; 8 unless given")
-    parser.add_argument("--out", type=Path, default=Path("runs/learned"), help="folder of the runs")
+    parser.add_argument("--out", type=Path, default=Path("runs/learned"), help="of the runs; runs/learned unless given")
     options = parser.parse_args()
     weights = HERE / "weights"
     weights.mkdir(exist_ok=True)
