@@ -114,3 +114,19 @@ def test_masked_max_ignores_padding_and_derives_to_one_row(axis):
     assert not gradient[1, 0].any()
     np.testing.assert_array_equal(jnp.sum(gradient, axis=axis), jnp.ones((2, 2)))
     assert set(np.unique(gradient)) == {0.0, 1.0}
+
+
+def test_masked_max_has_derivatives_in_both_modes(features, mask):
+    def total(features):
+        return jnp.sum(jnp.sin(masked_max(features[0], mask[0], 1)))
+
+    _, forward = jax.jvp(total, (features,), (weights := jnp.cos(features),))
+    np.testing.assert_allclose(forward, jnp.sum(jax.grad(total)(features) * weights), rtol=1e-9)
+
+
+def test_evaluation_seeks_no_place_of_the_maximum():
+    """On a CPU it takes several times as long to find as the maximum does, and only derivatives need it."""
+    program = jax.jit(masked_max).lower(jnp.ones((64, 8)), jnp.ones(64, bool)).compile().as_text()
+    assert "s32[64" not in program
+    place = jax.jit(jax.grad(lambda features: jnp.sum(masked_max(features, jnp.ones(64, bool)))))
+    assert "s32[64" in place.lower(jnp.ones((64, 8))).compile().as_text()

@@ -1,5 +1,7 @@
 """The layers that learned peers share: batch and group norm, layers applied to each point, and masked maxima."""
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -143,7 +145,19 @@ def masked_max(features: Array, mask: Array, axis: int = 0) -> Array:
     Its derivative goes to one row. That of ``jnp.max`` goes to the rows that equal the maximum, and is wrong where the
     compiler computes them a second time with another rounding.
     """
-    real = jnp.where(mask[..., None], features, -jnp.inf)
-    largest = jnp.argmax(jax.lax.stop_gradient(real), axis=axis, keepdims=True)
-    rows = jax.lax.broadcasted_iota(largest.dtype, real.shape, axis % real.ndim)
-    return jnp.sum(jnp.where(rows == largest, real, 0.0), axis=axis)
+    return _largest(jnp.where(mask[..., None], features, -jnp.inf), axis)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _largest(features: Array, axis: int) -> Array:
+    return jnp.max(features, axis=axis)
+
+
+@_largest.defjvp
+def _largest_jvp(axis: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (features,), (tangent,) = primals, tangents
+    largest = jnp.argmax(features, axis=axis, keepdims=True)
+    rows = jax.lax.broadcasted_iota(largest.dtype, features.shape, axis % features.ndim)
+    chosen = rows == largest
+    # The value comes from the same rows: computing the maximum, too, would take longer.
+    return tuple(jnp.sum(jnp.where(chosen, values, 0.0), axis=axis) for values in (features, tangent))

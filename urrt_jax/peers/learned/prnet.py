@@ -11,6 +11,7 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
+from urrt_jax.neighbors import top_rows
 from urrt_jax.peers.learned.graph import neighbor_edges
 from urrt_jax.peers.learned.layers import Layer, masked_max
 from urrt_jax.peers.learned.matching import hard_matches, scaled_products, soft_targets
@@ -143,9 +144,9 @@ def keypoints(cloud: Cloud, features: Array) -> Keypoints:
 
     The paper takes 512 of 768; for other clouds this is the same share, rounded down.
     """
-    norms = jnp.where(cloud.mask, jnp.sum(jax.lax.stop_gradient(features) ** 2, axis=1), -jnp.inf)
+    norms = jnp.where(cloud.mask, jnp.sum(features**2, axis=1), -jnp.inf)
     count = 2 * cloud.mask.shape[0] // 3
-    rows = jax.lax.top_k(norms, count)[1]
+    rows = top_rows(norms, count)
     mask = jnp.arange(count) < 2 * jnp.sum(cloud.mask) // 3
     return Keypoints(Cloud(jnp.where(mask[:, None], cloud.points[rows], 0.0), mask), features[rows])
 

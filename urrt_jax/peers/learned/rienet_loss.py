@@ -6,7 +6,7 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
-from urrt_jax.neighbors import nearest
+from urrt_jax.neighbors import nearest, top_rows
 from urrt_jax.rigid import Rigid
 
 _CHAMFER_SCALE = 0.01  # of squared distances; the released code's "loss margin"
@@ -29,8 +29,7 @@ def alignment_loss(moved: Cloud, target: Cloud) -> Array:
 
 def keypoints(weights: Array, mask: Array, count: int) -> tuple[Array, Array]:
     """The rows (K,) of the ``count`` real points of largest weight, K ≤ count, and which of them are real, (K,)."""
-    ranks = jnp.where(mask, jax.lax.stop_gradient(weights), -1.0)
-    rows = jax.lax.top_k(ranks, min(count, mask.shape[0]))[1]
+    rows = top_rows(jnp.where(mask, weights, -1.0), min(count, mask.shape[0]))
     return rows, mask[rows]
 
 
