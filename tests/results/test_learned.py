@@ -10,6 +10,7 @@ PAGE = " ".join((HERE / "learned" / "README.md").read_text().split())
 RESULTS = load("learned")
 PARITY = json.loads((HERE / "learned" / "parity.json").read_text())["rows"]
 WITH_COUNTERPARTS = ("dcp", "incomplete", "incomplete_both", "outliers", "prnet")
+LACKING = ("incomplete", "incomplete_both", "rpmnet")
 OURS = ("network", "plain", "register")
 
 
@@ -19,6 +20,11 @@ def _recall(protocol: str, method: str) -> float:
 
 def _mae(protocol: str, method: str) -> float:
     return measured(find_part(RESULTS, protocol))[method]["mae_rotation"]
+
+
+def _here(name: str) -> str:
+    """The row of a network that was trained here."""
+    return f"{name}:experiments/learned/weights/{name}.npz"
 
 
 def _mse(method: str) -> float:
@@ -35,14 +41,14 @@ PAPER = {name.removesuffix(" (paper)"): values for name, values in TRAINED["publ
 
 def _clean(name: str, value: str = "mae_rotation") -> float:
     """Of the clean pairs of table 3, where ``NAME:`` stands for the weights that were trained here."""
-    weights = f"{name}experiments/learned/weights/{name[:-1]}.npz" if name.endswith(":") else name
+    weights = _here(name[:-1]) if name.endswith(":") else name
     return measured(TRAINED)[weights][value]
 
 
 def _rienet(protocol: str, here: bool) -> float:
     """The share of pairs of table 2 that RIENet finds, trained here or with released weights."""
     parts = [part for part in load("table2_noise")["parts"] if part["title"].endswith("learned methods")]
-    name = "rienet:experiments/learned/weights/rienet.npz" if here else "rienet"
+    name = _here("rienet") if here else "rienet"
     return measured(find_part({"parts": parts}, protocol))[name]["recall_5deg_0.1"]
 
 
@@ -64,6 +70,14 @@ STATEMENTS = (
     f"at least {_least('network'):.2f}. Refined, it finds at least {_least('plain'):.2f}. RANSAC with ICP finds "
     f"at least {_least('ransac_icp'):.2f}",
     f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
+    f"it finds {_recall('dcp', _here('rpmnet')):.2f} of the clean pairs, {_recall('drift', _here('rpmnet')):.2f} with noise "
+    f"(P.D.), {_recall('outliers', _here('rpmnet')):.2f} with outliers and "
+    f"{_recall('independent', _here('rpmnet')):.2f} of the independent samples, but at most "
+    f"{max(_recall(each, _here('rpmnet')) for each in LACKING):.2f} where a cloud lacks a part",
+    f"there it finds {_recall('dcp', _here('deepgmr')):.2f} of them, elsewhere at most "
+    f"{max(_recall(each['protocol'], _here('deepgmr')) for each in RESULTS['parts'] if each['protocol'] != 'dcp'):.2f}",
+    f"trained here it finds {_recall('drift', _here('rienet')):.2f} of P.D., and "
+    f"{_recall('independent', _here('rienet')):.2f} of the independent samples",
     f"MAE(R) of {_clean('rienet:'):.3f}° and {_clean('deepgmr:'):.3f}°, RPM-Net {_clean('rpmnet:'):.2f}°",
     f"trained here it finds {_rienet('drift', True):.2f} of the pairs, the released weights, which never saw noise, "
     f"{_rienet('drift', False):.2f}",
