@@ -70,8 +70,8 @@ STATEMENTS = (
     f"at least {_least('network'):.2f}. Refined, it finds at least {_least('plain'):.2f}. RANSAC with ICP finds "
     f"at least {_least('ransac_icp'):.2f}",
     f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
-    f"it finds {_recall('dcp', _here('rpmnet')):.2f} of the clean pairs, {_recall('drift', _here('rpmnet')):.2f} with noise "
-    f"(P.D.), {_recall('outliers', _here('rpmnet')):.2f} with outliers and "
+    f"it finds {_recall('dcp', _here('rpmnet')):.2f} of the clean pairs, "
+    f"{_recall('drift', _here('rpmnet')):.2f} with noise (P.D.), {_recall('outliers', _here('rpmnet')):.2f} with outliers and "
     f"{_recall('independent', _here('rpmnet')):.2f} of the independent samples, but at most "
     f"{max(_recall(each, _here('rpmnet')) for each in LACKING):.2f} where a cloud lacks a part",
     f"there it finds {_recall('dcp', _here('deepgmr')):.2f} of them, elsewhere at most "
