@@ -72,7 +72,8 @@ STATEMENTS = (
     f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
     f"it finds {_recall('dcp', _here('rpmnet')):.2f} of the clean pairs, "
     f"{_recall('drift', _here('rpmnet')):.2f} with noise (P.D.), "
-    f"{_recall('outliers', _here('rpmnet')):.2f} with outliers and {_recall('independent', _here('rpmnet')):.2f} of the independent samples, "
+    f"{_recall('outliers', _here('rpmnet')):.2f} with outliers and "
+    f"{_recall('independent', _here('rpmnet')):.2f} of the independent samples, "
     f"but at most {max(_recall(each, _here('rpmnet')) for each in LACKING):.2f} where a cloud lacks a part",
     f"there it finds {_recall('dcp', _here('deepgmr')):.2f} of them, elsewhere at most "
     f"{max(_recall(each['protocol'], _here('deepgmr')) for each in RESULTS['parts'] if each['protocol'] != 'dcp'):.2f}",
