@@ -45,6 +45,18 @@ def _clean(name: str, value: str = "mae_rotation") -> float:
     return measured(TRAINED)[weights][value]
 
 
+COSTS = {
+    row["name"]: row["milliseconds_a_pair"]
+    for row in json.loads((HERE / "benchmarks" / "networks.json").read_text())["rows"]
+}
+
+
+def _cost(*names: str) -> str:
+    """What a pair takes, or the least and the most of several methods, in whole milliseconds."""
+    least, most = (f"{pick(COSTS[name] for name in names):.0f}" for pick in (min, max))
+    return least if least == most else f"{least} to {most}"
+
+
 def _rienet(protocol: str, here: bool) -> float:
     """The share of pairs of table 2 that RIENet finds, trained here or with released weights."""
     parts = [part for part in load("table2_noise")["parts"] if part["title"].endswith("learned methods")]
@@ -69,6 +81,11 @@ STATEMENTS = (
     ),
     f"at least {_least('network'):.2f}. Refined, it finds at least {_least('plain'):.2f}. RANSAC with ICP finds "
     f"at least {_least('ransac_icp'):.2f}",
+    f"a pair takes {_cost('register')} ms with `register`, {_cost('dcp_v1', *_LK)} ms with DCPv1 or PointNetLK, "
+    f"{_cost('deepgmr')} ms with DeepGMR, {_cost('rienet')} ms with RIENet, and "
+    f"{_cost('dcp_v2', 'rpmnet', 'prnet')} ms with DCPv2, RPM-Net or PRNet",
+    f"as fast as ICP ({_cost('icp')} ms)",
+    f"faster than FGR with ICP ({_cost('fgr_icp')} ms)",
     f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
     f"it finds {_recall('dcp', _here('rpmnet')):.2f} of the clean pairs, "
     f"{_recall('drift', _here('rpmnet')):.2f} with noise (P.D.), "
@@ -114,6 +131,12 @@ def test_only_ours_finds_most_pairs_of_every_protocol():
     names = measured(RESULTS["parts"][0])
     assert [name for name in names if _least(name) >= 0.75] == list(OURS)
     assert [name for name in names if _least(name) >= 0.65] == ["ransac_icp", *OURS]
+
+
+def test_networks_as_fast_as_classical_methods():
+    networks = {name: time for name, time in COSTS.items() if name not in ("icp", "fgr_icp")}
+    assert min(networks.values()) > COSTS["icp"]
+    assert {name for name, time in networks.items() if time < COSTS["fgr_icp"]} == {*OURS, "deepgmr"}
 
 
 def _apart(row: dict) -> float:

@@ -158,6 +158,9 @@ def _largest_jvp(axis: int, primals: tuple[Array], tangents: tuple[Array]) -> tu
     (features,), (tangent,) = primals, tangents
     largest = jnp.argmax(features, axis=axis, keepdims=True)
     rows = jax.lax.broadcasted_iota(largest.dtype, features.shape, axis % features.ndim)
-    chosen = rows == largest
+
+    def chosen(values: Array) -> Array:
+        return jnp.sum(jnp.where(rows == largest, values, 0.0), axis=axis)
+
     # The value comes from the same rows: computing the maximum, too, would take longer.
-    return tuple(jnp.sum(jnp.where(chosen, values, 0.0), axis=axis) for values in (features, tangent))
+    return chosen(features), chosen(tangent)
