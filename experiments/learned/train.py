@@ -58,7 +58,11 @@ def main() -> None:
     weights.mkdir(exist_ok=True)
     for method in options.methods:
         run = flags(method, options.data, options.out, options.minutes)
-        if run.run():
+        try:
+            stopped = run.run()
+        except (OSError, ValueError) as error:
+            parser.error(str(error))
+        if stopped:
             raise SystemExit(f"{method} was stopped; the same command goes on with it")
         for suffix in (".npz", ".json"):
             shutil.copyfile(run.out / f"model{suffix}", weights / f"{method}{suffix}")
