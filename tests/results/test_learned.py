@@ -85,7 +85,7 @@ STATEMENTS = (
     f"{_cost('deepgmr')} ms with DeepGMR, {_cost('rienet')} ms with RIENet, and "
     f"{_cost('dcp_v2', 'rpmnet', 'prnet')} ms with DCPv2, RPM-Net or PRNet",
     f"as fast as ICP ({_cost('icp')} ms)",
-    f"faster than FGR with ICP ({_cost('fgr_icp')} ms)",
+    f"slower than FGR with ICP ({_cost('fgr_icp')} ms)",
     f"({_mse('dcp_v1'):.1f} and {_mse('pointnetlk'):.1f})",
     f"it finds {_recall('dcp', _here('rpmnet')):.2f} of the clean pairs, "
     f"{_recall('drift', _here('rpmnet')):.2f} with noise (P.D.), "
@@ -136,7 +136,8 @@ def test_only_ours_finds_most_pairs_of_every_protocol():
 def test_networks_as_fast_as_classical_methods():
     networks = {name: time for name, time in COSTS.items() if name not in ("icp", "fgr_icp")}
     assert min(networks.values()) > COSTS["icp"]
-    assert {name for name, time in networks.items() if time < COSTS["fgr_icp"]} == {*OURS, "deepgmr"}
+    slow = {name for name, time in networks.items() if time > COSTS["fgr_icp"]}
+    assert slow == {"rienet", "dcp_v2", "rpmnet", "prnet"}
 
 
 def _apart(row: dict) -> float:
