@@ -283,9 +283,9 @@ def assess(
 
 
 @Program
-def label(model: Model, cloud: Prepared, moved: Rigid, encoding: Encoding) -> Array:
-    """The region of every point (N,), in the order in which the cloud was given; 0 for padding."""
-    labels = point_regions(model, rigid.apply(moved, cloud.cloud.points), encoding, count=cloud.count)
+def label(_: None, cloud: Prepared, moved: Rigid, encoding: Encoding) -> Array:
+    """The region of every point (N,), in the order in which the cloud was given; 0 for padding. See ``compare``."""
+    labels = point_regions(rigid.apply(moved, cloud.cloud.points), encoding, count=cloud.count)
     return jnp.zeros_like(labels).at[cloud.rows].set(jnp.where(cloud.cloud.mask, labels, 0))
 
 
@@ -373,8 +373,8 @@ def register_in_frame(
         transform=pose,
         coarse=start.coarse,
         report=report,
-        source_regions=call(label, model, clouds[0], start.seen, start.source),
-        target_regions=call(label, model, clouds[1], start.still, start.target),
+        source_regions=call(label, None, clouds[0], start.seen, start.source),
+        target_regions=call(label, None, clouds[1], start.still, start.target),
         steps=steps,
     )
 

@@ -114,8 +114,8 @@ def measure(data: str) -> dict:
         "EM-ICP, for the pairs that need it": took(expect, refine, *ready, settled),
         "compare with other poses": took(compare, None, *samples, last.transform),
         "assess": took(assess, True, *ready, last.transform, last.converged, alternatives, told),
-        "regions of both clouds": took(label, model, ready[0], start.seen, start.source)
-        + took(label, model, ready[1], start.still, start.target),
+        "regions of both clouds": took(label, None, ready[0], start.seen, start.source)
+        + took(label, None, ready[1], start.still, start.target),
         "register": 1e3 * median_seconds(whole, 7) / BATCH,
     }
     side = 2048

@@ -2,9 +2,11 @@
 
     python experiments/regions/run.py --data PATH
 
-Clean pairs of DCP's protocol, test shapes, the network's points. Consistency is the share of points whose counterpart
-in the other cloud has the same region: before anything is aligned, and in the last step of the network. Writes
-results.json, table.md and regions.png beside this file.
+Test shapes. Consistency is the share of points whose counterpart in the other cloud has the same region: before
+anything is aligned, on four protocols, and in the last step of the network on clean pairs. A point's counterpart is the
+nearest one under the true pose, if it lies within 0.1. Occupancy accuracy is the share of places about the clean target
+that the branches call inside or outside rightly. Writes results.json, table.md and regions.png beside this file; with
+--model it measures another network and prints only.
 """
 
 import argparse
@@ -18,18 +20,28 @@ import numpy as np
 from jax import Array
 
 from urrt_jax import load_model, model_card, rigid
-from urrt_jax.clouds import make_cloud, subsample
+from urrt_jax.clouds import first, make_cloud, subsample
 from urrt_jax.data import load_shapes
 from urrt_jax.evaluation import find_protocol
 from urrt_jax.frames import normalize_pair
+from urrt_jax.losses import shell_samples
 from urrt_jax.model import Model
 from urrt_jax.model.network import encode, estimate_subsampled, point_regions
+from urrt_jax.model.partition import branch_logits, occupancy_logits, see_places
 from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
 from urrt_jax.viewer import region_colors
+from urrt_jax.weights import DEFAULT
 
 HERE = Path(__file__).parent
-STRIDE, BATCH = 4, 64
+STRIDE, BATCH, QUERIES = 4, 64, 256
+NEAR = 0.1  # in units of the shape's bounding sphere
+PROTOCOLS = {
+    "dcp": "clean",
+    "drift": "P.D.",
+    "independent_noise": "independent + noise",
+    "incomplete_both": "D.I. two-sided",
+}
 SHOWN = (
     "airplane", "bed", "bench", "bookshelf", "car", "chair", "guitar", "monitor", "person", "piano", "sofa", "toilet",
 )  # fmt: skip
@@ -41,29 +53,39 @@ class Cut(NamedTuple):
     Attributes:
       source: (N,) label of every source point in its own pose.
       aligned: (N,) its label as the network's last step sees it.
-      target: (N,) label of every target point.
-      counterpart: (N,) the target point that each source point is.
+      target: (M,) label of every target point.
+      counterpart: (N,) the target point nearest to each source point.
+      near: (N,) bool, whether that is near enough to be its counterpart.
+      right: (Q,) bool, whether each place about the target is rightly called inside or outside.
     """
 
     source: Array
     aligned: Array
     target: Array
     counterpart: Array
+    near: Array
+    right: Array
 
 
 @jax.jit
 def cut(model: Model, sources: Array, targets: Array, rotations: Array, translations: Array) -> Cut:
-    """The regions of B pairs of clean clouds (B, N, 3), whose true pose is known."""
+    """The regions of B pairs of clouds (B, N, 3) and (B, M, 3), whose true pose is known."""
 
     def one(source_points: Array, target_points: Array, rotation: Array, translation: Array) -> Cut:
         source, target, frame = normalize_pair(make_cloud(source_points), make_cloud(target_points))
         truth = frame.enter(Rigid(rotation, translation))
         answer = estimate_subsampled(model, source, target)
+        found = nearest(rigid.apply(truth, source.points), target)
+        places, inside = shell_samples(jax.random.key(0), first(target, QUERIES * 2), QUERIES)
+        seen = see_places(model.config, answer.target.cloud, places, answer.target.shape)
+        occupancy = occupancy_logits(branch_logits(model.config, model.params["partition"], seen))
         return Cut(
-            source=point_regions(model, source.points, encode(model, subsample(source, model.config.points))),
-            aligned=point_regions(model, rigid.apply(answer.seen, source.points), answer.source),
-            target=point_regions(model, target.points, answer.target),
-            counterpart=nearest(rigid.apply(truth, source.points), target).index,
+            source=point_regions(source.points, encode(model, subsample(source, model.config.points))),
+            aligned=point_regions(rigid.apply(answer.seen, source.points), answer.source),
+            target=point_regions(target.points, answer.target),
+            counterpart=found.index,
+            near=found.squared < (NEAR / frame.scale) ** 2,
+            right=(occupancy > 0) == inside,
         )
 
     return jax.vmap(one)(sources, targets, rotations, translations)
@@ -74,27 +96,47 @@ def entropy(shares: np.ndarray) -> np.ndarray:
     return -np.sum(shares * np.log2(np.maximum(shares, 1e-12)), axis=-1)
 
 
-def measure(model: Model, points: np.ndarray) -> tuple[dict[str, float], Cut, np.ndarray, np.ndarray]:
-    """The numbers, the labels of all pairs, and their clouds."""
-    draw = find_protocol("dcp")
-    trials = [draw(points, item) for item in range(0, len(points), STRIDE)]
+def cut_all(model: Model, points: np.ndarray, protocol: str, stride: int) -> tuple[Cut, np.ndarray, np.ndarray]:
+    """The regions of every ``stride``-th shape's pair, and the clouds of these pairs."""
+    pair = find_protocol(protocol)
+    trials = [pair(points, item) for item in range(0, len(points), stride)]
     fields = [np.stack([getattr(trial, name) for trial in trials]).astype(np.float32) for name in trials[0]._fields[:4]]
     parts = [
         cut(model, *(jnp.asarray(field[at : at + BATCH]) for field in fields)) for at in range(0, len(trials), BATCH)
     ]
-    found: Cut = jax.tree.map(lambda *each: np.concatenate(each), *parts)
+    return jax.tree.map(lambda *each: np.concatenate(each), *parts), fields[0], fields[1]
+
+
+def consistency(labels: np.ndarray, found: Cut) -> float:
+    """The share of points with a counterpart whose counterpart has the same label; ``labels``: (B, N), the source's."""
     matched = np.take_along_axis(np.asarray(found.target), np.asarray(found.counterpart), axis=1)
+    return float(np.mean((labels == matched)[np.asarray(found.near)]))
+
+
+def measure(
+    model: Model, points: np.ndarray, stride: int = STRIDE
+) -> tuple[dict[str, float], Cut, np.ndarray, np.ndarray]:
+    """The numbers, and of the clean pairs the labels and the clouds."""
+    numbers, clean = {}, None
+    for protocol, title in PROTOCOLS.items():
+        found, *clouds = cut_all(model, points, protocol, stride)
+        numbers[f"consistency before alignment, {title}"] = consistency(np.asarray(found.source), found)
+        clean = clean or (found, *clouds)
+    found, sources, targets = clean
     shares = np.stack([np.mean(found.target == k, axis=1) for k in range(model.config.regions)], axis=-1)
-    numbers = {
-        "pairs": len(trials),
-        "consistency before alignment": np.mean(found.source == matched),
-        "consistency in the last step": np.mean(found.aligned == matched),
-        "regions with more than 1 % of all points": np.sum(shares.mean(axis=0) > 0.01),
-        "regions with more than 1 % of a shape's points, mean": np.mean(np.sum(shares > 0.01, axis=1)),
-        "entropy of the sizes, bits, all shapes together": entropy(shares.mean(axis=0)),
-        "entropy of the sizes, bits, mean over shapes": np.mean(entropy(shares)),
-    }
-    return {name: round(float(value), 4) for name, value in numbers.items()}, found, fields[0], fields[1]
+    numbers = (
+        {"pairs": len(sources)}
+        | numbers
+        | {
+            "consistency in the last step, clean": consistency(np.asarray(found.aligned), found),
+            "regions with more than 1 % of all points": np.sum(shares.mean(axis=0) > 0.01),
+            "regions with more than 1 % of a shape's points, mean": np.mean(np.sum(shares > 0.01, axis=1)),
+            "entropy of the sizes, bits, all shapes together": entropy(shares.mean(axis=0)),
+            "entropy of the sizes, bits, mean over shapes": np.mean(entropy(shares)),
+            "occupancy accuracy": np.mean(found.right),
+        }
+    )
+    return {name: round(float(value), 4) for name, value in numbers.items()}, found, sources, targets
 
 
 def draw(found: Cut, sources: np.ndarray, targets: np.ndarray, rows: dict[str, int], path: Path) -> None:
@@ -122,17 +164,20 @@ def draw(found: Cut, sources: np.ndarray, targets: np.ndarray, rows: dict[str, i
 
 
 def as_markdown(results: dict) -> str:
-    lines = ["| clean test pairs | |", "|---|---:|"]
+    lines = ["| test pairs | |", "|---|---:|"]
     return "\n".join(lines + [f"| {name} | {value:g} |" for name, value in results["numbers"].items()]) + "\n"
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
+    parser.add_argument("--model", help="a .npz file of 'urrt train', measured instead of the packaged weights")
     flags = parser.parse_args()
     shapes = load_shapes(flags.data, split="test", points=1024)
     names = np.asarray(shapes.classes)[shapes.labels][::STRIDE]
-    numbers, found, sources, targets = measure(load_model(), shapes.points)
+    numbers, found, sources, targets = measure(load_model(flags.model or DEFAULT), shapes.points)
+    if flags.model:
+        parser.exit(0, as_markdown({"numbers": numbers}))
     results = {
         "command": f"python experiments/regions/run.py --data {Path(flags.data).name}",
         "model_sha256": model_card()["sha256"],

@@ -126,3 +126,22 @@ def test_derivatives_are_those_of_finite_differences(points, x64):
     _, slope = jax.jvp(value, (wide,), (away,))
     found = (value(wide + 1e-6 * away) - value(wide - 1e-6 * away)) / 2e-6
     np.testing.assert_allclose(slope, found, rtol=1e-5)
+
+
+def test_places_on_the_cloud_are_described_as_its_points():
+    cloud = make_cloud(np.random.default_rng(0).normal(size=(70, 3)), np.arange(70) < 60)
+    described = moment_invariants(cloud, OCTAVES, cloud.points)
+    np.testing.assert_allclose(described[:60], moment_invariants(cloud, OCTAVES)[:60], atol=1e-5)
+
+
+def test_places_off_the_cloud_do_not_depend_on_the_pose(x64):
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    points, places = 0.5 * rng.normal(size=(70, 3)), 0.5 * rng.normal(size=(30, 3))
+    still, turned = (
+        moment_invariants(make_cloud(points @ each.T), OCTAVES, jnp.asarray(places @ each.T))
+        for each in (np.eye(3), turn)
+    )
+    assert still.shape == (30, invariant_count(OCTAVES))
+    np.testing.assert_allclose(turned, still, atol=1e-9)

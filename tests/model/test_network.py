@@ -19,14 +19,17 @@ from urrt_jax.model.attention import attention_weights
 from urrt_jax.model.encoder import shape_embedding
 from urrt_jax.model.network import encode, point_regions, predict, propose
 from urrt_jax.model.partition import (
+    Seen,
     branch_logits,
     occupancy_logits,
     pool_by_label,
     region_labels,
     region_scores,
+    see_places,
     split_regions,
 )
 from urrt_jax.training.pairs import PairConfig, make_pair
+from urrt_jax.training.trainable import PAIRS
 from urrt_jax.training.urrt import URRT
 
 _predict, _estimate, _encode = (jax.jit(each) for each in (predict, estimate, encode))
@@ -238,18 +241,25 @@ def test_estimate_has_no_derivative_in_the_partition(small_model, pair):
     assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.fixture(scope="module", params=["places", "parts"])
+def partition(request) -> str:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def loss_gradient(small_model, cloud):
+def loss_gradient(cloud, small_config, make_model, partition):
     """A function of the occupancy weight: the gradient of the mean training loss of four pairs."""
+    model = make_model(dataclasses.replace(small_config, partition=partition))
     pairs = PairConfig(points=64)
     batch = jax.vmap(lambda key: make_pair(key, jnp.asarray(cloud), pairs, 0.0))(jax.random.split(jax.random.key(0), 4))
-    method = URRT(model=small_model.config, loss_points=64, occupancy_queries=64, occupancy_weight=0.0)
+    method = URRT(model=model.config, loss_points=64, occupancy_queries=64, occupancy_weight=0.0)
 
     def losses(params):
-        loss, metrics, _ = jax.vmap(lambda one: method.loss({"params": params}, one, jax.random.key(1)))(batch)
-        return jnp.array([jnp.mean(loss), jnp.mean(metrics["occupancy"])])
+        loss = lambda one: method.loss({"params": params}, one, jax.random.key(1))[:2]  # noqa: E731
+        loss, metrics = jax.vmap(loss, axis_name=PAIRS)(batch)
+        return jnp.array([jnp.mean(loss), jnp.mean(metrics["occupancy"] - 2.0 * metrics.get("agreement", 0.0))])
 
-    jacobian = jax.jit(jax.jacrev(losses))(small_model.params)
+    jacobian = jax.jit(jax.jacrev(losses))(model.params)
     parts = [jax.tree.map(lambda leaf, i=i: leaf[i], jacobian) for i in range(2)]
 
     def gradient(weight: float):
@@ -267,7 +277,7 @@ def test_every_parameter_receives_a_gradient_from_the_training_loss(loss_gradien
     assert idle == []
 
 
-def test_partition_learns_from_occupancy_alone(loss_gradient):
+def test_partition_learns_from_its_own_losses_alone(loss_gradient):
     assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(loss_gradient(0.0)["partition"]))
 
 
@@ -335,7 +345,7 @@ def test_empty_cloud_leaves_the_answer_finite(model, pair):
 
 def test_labels_are_regions(small_model, pair):
     cloud = make_cloud(pair[0])
-    logits = branch_logits(small_model.config, small_model.params["partition"], cloud.points, jnp.zeros(16))
+    logits = branch_logits(small_model.config, small_model.params["partition"], Seen(cloud.points, jnp.zeros(16)))
     labels = region_labels(logits)
     assert labels.dtype == jnp.int32
     assert int(labels.min()) >= 0
@@ -357,7 +367,7 @@ def test_fresh_partition_uses_every_region(small_config):
 
 def test_labels_have_no_derivative(small_model, pair):
     def total(points):
-        logits = branch_logits(small_model.config, small_model.params["partition"], points, jnp.zeros(16))
+        logits = branch_logits(small_model.config, small_model.params["partition"], Seen(points, jnp.zeros(16)))
         return jnp.sum(region_labels(logits).astype(jnp.float32))
 
     assert not bool(jnp.any(jax.grad(total)(jnp.asarray(pair[0]))))
@@ -365,7 +375,8 @@ def test_labels_have_no_derivative(small_model, pair):
 
 def test_branches_read_the_direction_of_the_shape_embedding(small_model, pair):
     def logits(embedding):
-        return branch_logits(small_model.config, small_model.params["partition"], jnp.asarray(pair[0]), embedding)
+        seen = Seen(jnp.asarray(pair[0]), embedding)
+        return branch_logits(small_model.config, small_model.params["partition"], seen)
 
     embedding = jax.random.normal(jax.random.key(0), (16,))
     np.testing.assert_allclose(logits(embedding), logits(7 * embedding), atol=1e-4)
@@ -373,21 +384,44 @@ def test_branches_read_the_direction_of_the_shape_embedding(small_model, pair):
     assert bool(jnp.all(jnp.isfinite(jax.grad(lambda e: jnp.sum(logits(e)))(jnp.zeros(16)))))  # an empty cloud's
 
 
+def test_parts_do_not_depend_on_the_pose(small_config, make_model, cloud, pose, x64):
+    model = make_model(dataclasses.replace(small_config, partition="parts"))
+    still = cloud[:60] - cloud[:60].mean(axis=0)
+    first, second = (_encode(model, make_cloud(points)).regions for points in (still, still @ pose[0].T))
+    np.testing.assert_allclose(second.scores, first.scores, atol=1e-4)
+    assert len(np.unique(first.labels)) > 1
+
+
+def test_places_do_depend_on_the_pose(small_model, cloud, pose, x64):
+    still = cloud[:60] - cloud[:60].mean(axis=0)
+    first, second = (_encode(small_model, make_cloud(points)).regions for points in (still, still @ pose[0].T))
+    assert bool(np.any(np.asarray(second.labels) != np.asarray(first.labels)))
+
+
+def test_parts_of_a_place_are_those_of_a_point_there(small_config, make_model, pair):
+    config = dataclasses.replace(small_config, partition="parts")
+    model, cloud = make_model(config), make_cloud(pair[0], np.arange(60) < 50)
+    encoding = _encode(model, cloud)
+    seen = see_places(config, cloud, cloud.points, encoding.shape)
+    scores = region_scores(branch_logits(config, model.params["partition"], seen))
+    np.testing.assert_allclose(scores[:50], encoding.regions.scores[:50], atol=1e-5)
+
+
 def test_occupancy_can_say_outside():
     assert float(occupancy_logits(jnp.array([-3.0, -5.0]))) == -3
-
-
-def test_point_regions_in_chunks_agree_with_all_at_once(small_model, pair):
-    cloud = make_cloud(pair[0])
-    encoding = encode(small_model, cloud)
-    chunked = point_regions(small_model, cloud.points, encoding, batch_size=7)
-    np.testing.assert_array_equal(chunked, point_regions(small_model, cloud.points, encoding))
 
 
 def test_point_regions_are_those_that_the_network_used(small_model, pair):
     cloud = make_cloud(pair[0])
     encoding = encode(small_model, cloud)
-    np.testing.assert_array_equal(point_regions(small_model, cloud.points, encoding), encoding.regions.labels)
+    np.testing.assert_array_equal(point_regions(cloud.points, encoding), encoding.regions.labels)
+
+
+def test_point_regions_off_the_cloud_are_those_of_the_nearest_point(small_model, pair):
+    encoding = encode(small_model, make_cloud(pair[0], np.arange(60) < 50))
+    places = np.random.default_rng(0).normal(size=(90, 3))
+    near = np.argmin(np.linalg.norm(places[:, None] - pair[0][:50], axis=-1), axis=1)
+    np.testing.assert_array_equal(point_regions(jnp.asarray(places), encoding), encoding.regions.labels[near])
 
 
 def _labelled(seed: int = 0):
@@ -426,7 +460,10 @@ def test_split_regions_agrees_with_numpy(cloud):
     mask = np.arange(200) % 4 != 0
     rng = np.random.default_rng(0)
     features, labels = rng.normal(size=(200, 5)).astype(np.float32), rng.integers(0, 3, 200)
-    regions = split_regions(make_cloud(cloud, mask), jnp.asarray(features), jnp.asarray(labels), 4)
+    logits = jax.nn.one_hot(labels, 4)
+    regions = split_regions(make_cloud(cloud, mask), jnp.asarray(features), logits)
+    np.testing.assert_array_equal(regions.labels, np.where(mask, labels, 0))
+    np.testing.assert_allclose(regions.scores, jax.nn.softmax(logits), rtol=1e-6)
     for k in range(3):
         mine = mask & (labels == k)
         assert float(regions.counts[k]) == mine.sum()
@@ -442,6 +479,8 @@ def test_shape_embedding_of_an_empty_cloud_is_zero():
     ("fields", "says"),
     [
         ({"variant": "D"}, "^variant: .*'D'"),
+        ({"partition": "pieces"}, "^partition: .*'pieces'"),
+        ({"partition": "parts", "octaves": 0}, "^octaves: "),
         ({"decoder": "9D"}, "^decoder: .*'9D'"),
         ({"landmarks": 0}, "^landmarks: .*0"),
         ({"octaves": -1}, "^octaves: .*-1"),

@@ -22,6 +22,7 @@ from urrt_jax.neighbors import LARGE
 # The rows were measured before some options were renamed, removed or added; `quick` is a constant of the code today.
 _RENAMED = {"soft_points": "em_points"}
 _REMOVED = {"mutual": False, "trim": False, "rotations": 0, "quick": 512}
+_ADDED = {"partition": "places"}  # what networks had before there was a choice
 
 
 def _in_todays_words(identity):
@@ -32,7 +33,7 @@ def _in_todays_words(identity):
             assert all(options[name] == off for name, off in _REMOVED.items() if name in options)
             options = {_RENAMED.get(name, name): each for name, each in options.items() if name not in _REMOVED}
         parts[part] = options
-    return identity | parts
+    return identity | parts | {"config": _ADDED | identity["config"]}
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,8 @@ class NetworkFlags:
         variant: A: one decoder, no regions. B: regions, attention, one decoder a region. C: as B, and the attention
             knows where the regions are.
         regions: Regions that the network cuts a cloud into.
+        partition: What tells regions apart: where points lie, or what surrounds them, so that regions turn with the
+            shape.
         width: Dimension of the embeddings.
         attention_layers: Self-attention layers over the regions.
         decoder: What a region's decoder gives: landmarks to align, or the pose itself.
@@ -40,6 +42,7 @@ class NetworkFlags:
 
     variant: Literal["A", "B", "C"] = "C"
     regions: int = 8
+    partition: Literal["places", "parts"] = "places"
     width: int = 128
     attention_layers: int = 1
     decoder: Literal["landmarks", "pose"] = "landmarks"
@@ -86,7 +89,7 @@ class PairFlags:
     outliers: float = 0.2
 
 
-_OURS = ("model", "queries", "occupancy_weight", "loss_points", "unrolled", "lookups", "rounds")
+_OURS = ("model", "queries", "occupancy_weight", "agreement_weight", "loss_points", "unrolled", "lookups", "rounds")
 """The flags that belong to our own network."""
 
 
@@ -123,6 +126,8 @@ class Train:
             ours 1e-3.
         warmup: Steps in which the learning rate rises.
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
+        agreement_weight: Weight of the loss that cuts all clouds of a shape alike, against that of occupancy, where
+            regions are parts.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
         unrolled: How many of the network's steps are run in training, at most --model.steps.
         lookups: Points of each cloud that are looked up in training, at most the model's.
@@ -154,6 +159,7 @@ class Train:
     learning_rate: float | None = None
     warmup: int = 200
     occupancy_weight: float = 0.02
+    agreement_weight: float = 2.0
     loss_points: int = 512
     unrolled: int = 2
     lookups: int = 256

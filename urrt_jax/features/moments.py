@@ -20,6 +20,10 @@ _HIGHEST = jax.lax.Precision.HIGHEST
 _ROWS = 64  # points a block
 _FLAT = 1e-4  # added to what a root is taken of, whose slope is infinite at zero
 _NEAR = 0.05  # of a width: means nearer than this have no direction
+# About what the invariants are for points of a shape's surface, and how far they differ: per width trace, area, volume,
+# reach and spread along it; then growths, cosines, triple products. Rough, and the same for all widths.
+_USUAL = (1.4, 0.7, 0.4, 0.4, 0.45), 1.2, 0.65, 0.0
+_DIFFERING = (0.35, 0.2, 0.15, 0.2, 0.2), 0.25, 0.4, 0.25
 _FINEST = 0.1  # of the unit radius: about the distance of neighbours among 512 points of a surface
 
 
@@ -29,19 +33,31 @@ def invariant_count(octaves: int) -> int:
     return 5 * octaves + max(octaves - 1, 0) + pairs + triples
 
 
-def moment_invariants(cloud: Cloud, octaves: int) -> Array:
+def centred_invariants(invariants: Array, octaves: int) -> Array:
+    """Invariants (..., ``invariant_count``) less what they usually are, divided by how far they usually differ."""
+    pairs, triples = octaves * (octaves - 1) // 2, octaves * (octaves - 1) * (octaves - 2) // 6
+    usual, differing = (
+        np.concatenate([np.tile(each, octaves), np.repeat(others, [max(octaves - 1, 0), pairs, triples])])
+        for each, *others in (_USUAL, _DIFFERING)
+    )
+    return (invariants - jnp.asarray(usual, invariants.dtype)) / jnp.asarray(differing, invariants.dtype)
+
+
+def moment_invariants(cloud: Cloud, octaves: int, places: Array | None = None) -> Array:
     """Invariants (N, ``invariant_count``) of the surroundings of every point under rigid motions of the cloud.
 
     Widths of the Gaussians are 0.1, 0.2, 0.4, … of the frame's unit. All but the triple products, the last columns,
-    are the same for a mirrored cloud; those change sign. They cost N² in time. Zero for padding.
+    are the same for a mirrored cloud; those change sign. They cost N² in time, N·Q for Q places. Zero for padding.
 
     Args:
       cloud: N points in a frame of unit radius (``normalize_pair``).
       octaves: how many widths.
+      places: (Q, 3), on the cloud or off it: what is described instead of the cloud's own points.
     """
-    if octaves == 0:
-        return jnp.zeros((cloud.points.shape[0], 0), cloud.points.dtype)
     points, mask = cloud
+    described = points if places is None else places
+    if octaves == 0:
+        return jnp.zeros((described.shape[0], 0), points.dtype)
     widths = [_FINEST * 2**octave for octave in range(octaves)]
     upper = jnp.array([0, 0, 0, 1, 1, 2]), jnp.array([0, 1, 2, 1, 2, 2])
     products = points[:, upper[0]] * points[:, upper[1]]
@@ -61,8 +77,8 @@ def moment_invariants(cloud: Cloud, octaves: int) -> Array:
         return jnp.stack(totals[::-1])
 
     # In blocks that stay in the cache; all N² weights at once take twice the time.
-    count = points.shape[0]
-    blocks = jnp.pad(points, ((0, -count % _ROWS), (0, 0))).reshape(-1, _ROWS, 3)
+    count = described.shape[0]
+    blocks = jnp.pad(described, ((0, -count % _ROWS), (0, 0))).reshape(-1, _ROWS, 3)
     totals = jnp.moveaxis(jax.lax.map(weighted, blocks), 1, 0).reshape(octaves, -1, moments.shape[1])[:, :count]
     # All octaves at once, (K, N): what follows is compiled once instead of once an octave.
     scale = jnp.array(widths, points.dtype)[:, None]
@@ -72,7 +88,7 @@ def moment_invariants(cloud: Cloud, octaves: int) -> Array:
     xx, xy, xz, yy, yz, zz = jnp.moveaxis(spread, -1, 0)
     area = xx * yy + xx * zz + yy * zz - xy**2 - xz**2 - yz**2
     volume = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    offset = (mean - points) / scale[..., None]
+    offset = (mean - described) / scale[..., None]
     reach = jnp.sum(offset**2, axis=-1)
     offset = offset / jnp.sqrt(reach + _NEAR**2)[..., None]
     x, y, z = jnp.moveaxis(offset, -1, 0)
@@ -87,4 +103,4 @@ def moment_invariants(cloud: Cloud, octaves: int) -> Array:
     cosines = jnp.sum(offset[pairs[0]] * offset[pairs[1]], axis=-1)
     volumes = jnp.sum(offset[triples[0]] * cross(offset[triples[1]], offset[triples[2]]), axis=-1)
     columns = jnp.concatenate([shapes, logarithm[1:] - logarithm[:-1], cosines, volumes])
-    return jnp.where(mask[:, None], columns.T, 0.0)
+    return jnp.where(mask[:, None], columns.T, 0.0) if places is None else columns.T

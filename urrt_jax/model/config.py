@@ -17,7 +17,9 @@ class ModelConfig:
       regions: n, the number of regions (8 and 12 in BAE-NET).
       width: d, the dimension of embeddings and region features.
       encoder_widths: hidden widths of the point encoder, before its last layer of ``width``.
-      branch_width: hidden width of every region branch h_k.
+      partition: what the branches h_k see of a point. "places": where it lies, as in the paper; regions follow the
+        pose. "parts": what surrounds it, which no pose changes (needs ``octaves``).
+      branch_width: hidden width of every branch h_k; those that see surroundings share two layers of twice this width.
       position_widths: hidden widths of the position encoding δ.
       attention_layers: self-attention layers over the regions.
       decoder: what the decoders g_k give. "landmarks": the places of ``landmarks`` matching landmarks in both clouds,
@@ -38,6 +40,7 @@ class ModelConfig:
     regions: int = 8
     width: int = 128
     encoder_widths: tuple[int, ...] = (64, 64, 128)
+    partition: Literal["places", "parts"] = "places"
     branch_width: int = 32
     position_widths: tuple[int, ...] = (64,)
     attention_layers: int = 1
@@ -56,11 +59,15 @@ class ModelConfig:
     def __post_init__(self) -> None:
         if self.variant not in ("A", "B", "C"):
             raise ValueError(f"variant: expected 'A', 'B' or 'C', got {self.variant!r}")
+        if self.partition not in ("places", "parts"):
+            raise ValueError(f"partition: expected 'places' or 'parts', got {self.partition!r}")
         if self.decoder not in ("landmarks", "pose"):
             raise ValueError(f"decoder: expected 'landmarks' or 'pose', got {self.decoder!r}")
         check_whole(self, regions=1, width=1, branch_width=1, attention_layers=0, landmarks=1, key_width=1)
         check_positive(self, "sharpness")
         check_whole(self, octaves=0, lookups=0, consensus=0, hypotheses=0, steps=1, points=3)
+        if self.has_regions and self.partition == "parts" and not self.octaves:
+            raise ValueError("octaves: parts are told apart by the surroundings of points, got 0 widths of them")
         for name in ("encoder_widths", "position_widths", "decoder_widths"):
             widths = getattr(self, name)
             object.__setattr__(self, name, tuple(widths))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud
+from urrt_jax.maxima import masked_max
 from urrt_jax.model.blocks import Perceptron, run
 from urrt_jax.model.config import ModelConfig
 
@@ -26,8 +27,7 @@ class PointEncoder(nn.Module):
 
 def shape_embedding(features: Array, mask: Array) -> Array:
     """e: the maximum of the real points' embeddings, (d,), from (N, d) and (N,); zero for an empty cloud."""
-    pooled = jnp.max(jnp.where(mask[:, None], features, -jnp.inf), axis=0)
-    return jnp.where(jnp.any(mask), pooled, 0.0)
+    return jnp.where(jnp.any(mask), masked_max(features, mask), 0.0)
 
 
 def encode_points(config: ModelConfig, params: dict, cloud: Cloud, invariants: Array) -> tuple[Array, Array]:

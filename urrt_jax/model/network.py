@@ -15,13 +15,14 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, subsample
 from urrt_jax.features.moments import invariant_count, moment_invariants
 from urrt_jax.frames import normalize_pair
-from urrt_jax.loops import each_cloud, largest
+from urrt_jax.loops import each_cloud
 from urrt_jax.model.attention import RegionTransformer
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.decoder import decode, decode_hypotheses, init_decoder
 from urrt_jax.model.encoder import PointEncoder
 from urrt_jax.model.encoding import Encoding, encode_cloud
-from urrt_jax.model.partition import RegionBranches, branch_logits, region_labels
+from urrt_jax.model.partition import init_branches
+from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
 
 
@@ -61,12 +62,11 @@ def init_model(key: Array, config: ModelConfig) -> Model:
     """A model with fresh parameters drawn from ``key``."""
     keys = jax.random.split(key, 4)
     n, d = config.regions, config.width
-    points, embedding = jnp.zeros((1, 3)), jnp.zeros(d)
     described = jnp.zeros((1, 3 + invariant_count(config.octaves)))
     params = {"encoder": PointEncoder(config).init(keys[0], described)["params"]}
     if config.has_regions:
         sequence = jnp.zeros((n, d)), jnp.zeros((n, 3)), jnp.ones(n, bool)
-        params["partition"] = RegionBranches(config).init(keys[1], points, embedding)["params"]
+        params["partition"] = init_branches(config, keys[1])
         # Without attention layers and position encoding this stage learns nothing and has no parameters.
         params["attention"] = RegionTransformer(config).init(keys[2], *sequence).get("params", {})
     params["decoder"] = init_decoder(config, keys[3])
@@ -123,28 +123,12 @@ def predict(model: Model, source: Cloud, target: Cloud) -> Rigid:
     return frame.leave(estimate_subsampled(model, source, target).transform)
 
 
-def point_regions(
-    model: Model, points: Array, encoding: Encoding, *, count: Array | None = None, batch_size: int = 2048
-) -> Array:
-    """The region label (N,) int32 of any points (N, 3) in the network's frame; zeros for model A.
+def point_regions(points: Array, encoding: Encoding, *, count: Array | None = None) -> Array:
+    """The region (N,) int32 of any points (N, 3) in the network's frame: that of the nearest point it has looked at.
 
     Args:
-      model: the network.
       points: on the cloud or off it.
       encoding: of the cloud whose regions these are.
-      count: (), the points from this row on are padding and get label 0; None where all are wanted.
-      batch_size: large clouds go through in chunks of so many points, which a processor's cache holds.
+      count: (), the points from this row on are padding, whose answers mean nothing; None where all are wanted.
     """
-    size = points.shape[0]
-    if not model.config.has_regions:
-        return jnp.zeros(size, jnp.int32)
-    chunk = min(size, batch_size)
-    chunks = jnp.pad(points, ((0, -size % chunk), (0, 0))).reshape(-1, chunk, 3)
-
-    def label(number: Array, labels: Array) -> Array:
-        logits = branch_logits(model.config, model.params["partition"], chunks[number], encoding.embedding)
-        return labels.at[number].set(region_labels(logits))
-
-    used = largest(jnp.array(size) if count is None else count)
-    labels = jax.lax.fori_loop(0, (used + chunk - 1) // chunk, label, jnp.zeros(chunks.shape[:2], jnp.int32))
-    return labels.reshape(-1)[:size]
+    return encoding.regions.labels[nearest(points, encoding.cloud, count=count).index]

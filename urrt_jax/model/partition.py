@@ -3,6 +3,10 @@
 One set of branches serves source and target, so that region k means the same part in both. The softmax of the branches
 gives the region. The paper also takes the occupancy from that softmax, which cannot say "outside"; here it is the
 largest logit (``occupancy_logits``).
+
+There are two kinds of branches. ``PlaceBranches`` are the paper's: they see where a point lies, so that regions stay
+where they are while the shape turns beneath them. ``PartBranches`` see what surrounds a point, so that regions turn
+with the shape. Both see something of the whole cloud, too, which tells them what shape it is.
 """
 
 from typing import NamedTuple
@@ -14,6 +18,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud, centroid
+from urrt_jax.features.moments import centred_invariants, invariant_count, moment_invariants
+from urrt_jax.maxima import masked_max, maximum
 from urrt_jax.model.blocks import run
 from urrt_jax.model.config import ModelConfig
 
@@ -24,17 +30,31 @@ class Regions(NamedTuple):
     Attributes:
       labels: (N,) int32, the region of every point; padding has label 0 and counts nowhere.
       counts: (n,) float, real points in each region, N_k.
+      scores: (N, n), s_k of every point; (N, 1) ones where the whole cloud is one region.
       features: (n, d), the region feature sequence l, and after attention the sequence a; zero for an empty region.
       centroids: (n, 3), the mean of each region's points, in the network's frame; zero for an empty region.
     """
 
     labels: Array
     counts: Array
+    scores: Array
     features: Array
     centroids: Array
 
 
-class RegionBranches(nn.Module):
+class Seen(NamedTuple):
+    """What the branches see.
+
+    Attributes:
+      points: (Q, 3) or (Q, q), of points on the cloud or off it: places, or centred invariants of what surrounds them.
+      shape: (d,) or (2q,), of the whole cloud: its embedding e, or the mean and the maximum of its points' invariants.
+    """
+
+    points: Array
+    shape: Array
+
+
+class PlaceBranches(nn.Module):
     """The functions {h_k} of eq. (1): n perceptrons of [x, e/‖e‖] with one hidden layer, each with weights of its own.
 
     The hidden layer is split into a part for x and a part for e, which is the same layer, but e's part is computed once
@@ -48,7 +68,7 @@ class RegionBranches(nn.Module):
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, points: Array, embedding: Array) -> Array:
+    def __call__(self, seen: Seen) -> Array:
         """Branch logits (Q, n) of points (Q, 3), given the shape embedding (d,)."""
         n, width = self.config.regions, self.config.branch_width
         directions = self.param("directions", _unit_columns, (3, n * width))
@@ -56,14 +76,34 @@ class RegionBranches(nn.Module):
         faint = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
         # Only e's direction, as long as x: a step of Adam would move the branches farther through e than through x, all
         # shapes would look alike to them, and few regions would stay in use.
-        direction = embedding / jnp.sqrt(jnp.sum(embedding**2) + 1e-6)
+        direction = seen.shape / jnp.sqrt(jnp.sum(seen.shape**2) + 1e-6)
         shape = nn.Dense(n * width, use_bias=False, kernel_init=faint, name="shape")(direction)
         # A unit looking along u rises by |x|/4 on average over all directions u: the sum falls by 4 a unit of length.
         out = self.param("out", nn.initializers.constant(-16.0 / width), (n, width, 1))
         bias = self.param("bias", nn.initializers.constant(2.0), (n,))
-        hidden = nn.leaky_relu(points @ directions + offsets + shape, 0.02)
+        hidden = nn.leaky_relu(seen.points @ directions + offsets + shape, 0.02)
         # One product with a block-diagonal matrix: n small ones are slower on every device tried.
         return hidden @ jax.scipy.linalg.block_diag(*out) + bias
+
+
+class PartBranches(nn.Module):
+    """Functions {h_k} of what surrounds a point: one perceptron with n outputs, whose hidden layers they share.
+
+    What surrounds a point is the same in every pose, and so are the regions. Without the loss of ``losses.agreement``
+    few of them stay in use.
+    """
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, seen: Seen) -> Array:
+        """Branch logits (Q, n) of the invariants (Q, q) of points, given those of the whole cloud (2q,)."""
+        width = 2 * self.config.branch_width
+        # Most of what a fresh network sees of the shape is the same for all its points, and must not decide alone.
+        faint = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
+        hidden = nn.Dense(width)(seen.points) + nn.Dense(width, use_bias=False, kernel_init=faint)(seen.shape)
+        hidden = nn.Dense(width)(nn.leaky_relu(hidden, 0.02))
+        return nn.Dense(self.config.regions)(nn.leaky_relu(hidden, 0.02))
 
 
 def anchors(count: int) -> Array:
@@ -80,9 +120,38 @@ def _unit_columns(key: Array, shape: tuple[int, int]) -> Array:
     return columns / jnp.linalg.norm(columns, axis=0)
 
 
-def branch_logits(config: ModelConfig, params: dict, points: Array, embedding: Array) -> Array:
-    """h_k([x, e]) for all k: (Q, n), for any points (Q, 3) in the network's frame, on the cloud or off it."""
-    return run(RegionBranches(config), params, points, embedding)
+def branches(config: ModelConfig) -> nn.Module:
+    """The branches {h_k} of eq. (1), of the configured kind."""
+    return PartBranches(config) if config.partition == "parts" else PlaceBranches(config)
+
+
+def init_branches(config: ModelConfig, key: Array) -> dict:
+    """Fresh parameters of the branches."""
+    q = invariant_count(config.octaves)
+    points, shape = (3, config.width) if config.partition == "places" else (q, 2 * q)
+    return dict(branches(config).init(key, Seen(jnp.zeros((1, points)), jnp.zeros(shape)))["params"])
+
+
+def see_cloud(config: ModelConfig, cloud: Cloud, embedding: Array, invariants: Array) -> Seen:
+    """What the branches see of a cloud of N points with the shape embedding (d,) and invariants (N, q)."""
+    if config.partition == "places":
+        return Seen(cloud.points, jax.lax.stop_gradient(embedding))
+    real, points = cloud.mask[:, None], centred_invariants(invariants, config.octaves)
+    mean = jnp.sum(jnp.where(real, points, 0.0), axis=0) / jnp.maximum(jnp.sum(cloud.mask), 1)
+    largest = jnp.where(jnp.any(cloud.mask), masked_max(points, cloud.mask), 0.0)
+    return Seen(points, jax.lax.stop_gradient(jnp.concatenate([mean, largest])))
+
+
+def see_places(config: ModelConfig, cloud: Cloud, places: Array, shape: Array) -> Seen:
+    """What the branches see of places (Q, 3) on a cloud or off it, given what they see of the cloud itself."""
+    if config.partition == "places":
+        return Seen(places, shape)
+    return Seen(centred_invariants(moment_invariants(cloud, config.octaves, places), config.octaves), shape)
+
+
+def branch_logits(config: ModelConfig, params: dict, seen: Seen) -> Array:
+    """h_k for all k: (Q, n), of Q points on the cloud or off it; [x, e] of eq. (1) is what the paper's branches see."""
+    return run(branches(config), params, seen)
 
 
 def region_scores(logits: Array) -> Array:
@@ -101,14 +170,15 @@ def occupancy_logits(logits: Array) -> Array:
     The paper max-pools the softmax, whose maximum cannot fall below 1/n and so cannot say "outside"; the branches'
     own logits can (Chen et al. 2019, BAE-NET).
     """
-    return jnp.max(logits, axis=-1)
+    return maximum(logits, -1)
 
 
 def whole_region(cloud: Cloud, embedding: Array) -> Regions:
     """The whole cloud of N points as one region, whose feature is the shape embedding (d,)."""
     labels = jnp.zeros(cloud.mask.shape, jnp.int32)
     real = jnp.sum(cloud.mask).astype(cloud.points.dtype)
-    return Regions(labels, real[None], embedding[None], centroid(cloud)[None])
+    ones = jnp.ones((cloud.mask.shape[0], 1), cloud.points.dtype)
+    return Regions(labels, real[None], ones, embedding[None], centroid(cloud)[None])
 
 
 @jax.custom_jvp
@@ -123,6 +193,8 @@ def pool_by_label(features: Array, labels: Array, groups: Array) -> Array:
 @pool_by_label.defjvp
 def _pool_by_label_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     features, labels, groups = primals
+    # Computed once: a second time, with another rounding, no feature would equal the maximum.
+    features = jax.lax.optimization_barrier(features)
     pooled = pool_by_label(features, labels, groups)
     size = features.shape[0]
     rows = jnp.arange(size)[:, None]
@@ -132,18 +204,18 @@ def _pool_by_label_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return pooled, jnp.where(jnp.isfinite(pooled), tangent, 0.0)
 
 
-def split_regions(cloud: Cloud, features: Array, labels: Array, regions: int) -> Regions:
-    """The regions of a cloud: counts, max-pooled features (the sequence l) and centroids.
+def split_regions(cloud: Cloud, features: Array, logits: Array) -> Regions:
+    """The regions of a cloud: labels, counts, max-pooled features (the sequence l) and centroids.
 
     Args:
       cloud: N points.
       features: (N, d) point embeddings.
-      labels: (N,) int.
-      regions: n.
+      logits: (N, n), of the branches.
     """
-    chex.assert_shape(labels, cloud.mask.shape)
+    chex.assert_shape(logits, (*cloud.mask.shape, None))
     chex.assert_shape(features, (*cloud.mask.shape, None))
-    labels = jnp.where(cloud.mask, labels, 0)
+    regions = logits.shape[1]
+    labels = jnp.where(cloud.mask, region_labels(logits), 0)
     kept = jnp.where(cloud.mask, labels, regions)
     member = (kept[:, None] == jnp.arange(regions)).astype(cloud.points.dtype)
     counts = jnp.sum(member, axis=0)
@@ -152,6 +224,7 @@ def split_regions(cloud: Cloud, features: Array, labels: Array, regions: int) ->
     return Regions(
         labels=labels,
         counts=counts,
+        scores=region_scores(logits),
         features=jnp.where(counts[:, None] > 0, pooled, 0.0),
         centroids=sums / jnp.maximum(counts, 1.0)[:, None],
     )

@@ -8,15 +8,20 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.checks import check_positive, check_whole
-from urrt_jax.clouds import first, shift
-from urrt_jax.frames import normalize_pair
-from urrt_jax.losses import chamfer, occupancy_loss, shell_samples
+from urrt_jax.clouds import Cloud, first, shift
+from urrt_jax.features import moment_invariants
+from urrt_jax.frames import Frame, normalize_pair
+from urrt_jax.losses import chamfer, mutual_information, occupancy_loss, region_pairs, shell_samples
 from urrt_jax.model import Model, ModelConfig, init_model
-from urrt_jax.model.network import estimate_subsampled, predict
-from urrt_jax.model.partition import branch_logits, occupancy_logits
+from urrt_jax.model.network import Estimate, estimate_subsampled
+from urrt_jax.model.partition import branch_logits, occupancy_logits, region_scores, see_cloud, see_places
+from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
-from urrt_jax.training.pairs import Pair
-from urrt_jax.training.trainable import Metrics, Trainable, Variables
+from urrt_jax.training.pairs import Pair, add_noise, crop
+from urrt_jax.training.trainable import PAIRS, Metrics, Trainable, Variables
+
+# Of the samples whose regions are to agree: largest deviation of the noise, smallest share that a crop keeps.
+_NOISE, _KEEP = 0.03, 0.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,6 +31,7 @@ class URRT(Trainable):
     Attributes:
       model: the network.
       occupancy_weight: weight of the occupancy loss against the Chamfer loss.
+      agreement_weight: weight of the agreement of regions against the occupancy loss, where regions are parts.
       occupancy_queries: points at which occupancy is asked, per pair.
       chamfer_scale: scale of the Chamfer penalty, in units of the normalised pair.
       loss_points: points of each whole cloud that the Chamfer loss compares.
@@ -37,6 +43,7 @@ class URRT(Trainable):
 
     model: ModelConfig = ModelConfig()
     occupancy_weight: float = 0.02
+    agreement_weight: float = 2.0
     occupancy_queries: int = 256
     chamfer_scale: float = 0.1
     loss_points: int = 512
@@ -47,8 +54,9 @@ class URRT(Trainable):
     def __post_init__(self) -> None:
         check_whole(self, occupancy_queries=1, loss_points=1, unrolled=1, lookups=0, rounds=0)
         check_positive(self, "chamfer_scale")
-        if self.occupancy_weight < 0:
-            raise ValueError(f"occupancy_weight: expected at least 0, got {self.occupancy_weight}")
+        for name in ("occupancy_weight", "agreement_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
 
     @property
     def name(self) -> str:
@@ -60,15 +68,27 @@ class URRT(Trainable):
         return {"params": init_model(key, self.model).params}
 
     def loss(self, variables: Variables, pair: Pair, key: Array) -> tuple[Array, Metrics, Variables]:
-        """``pair_loss`` of the network as training runs it."""
-        loss, metrics = pair_loss(Model(self.training_network(), variables["params"]), pair, key, self)
+        """The paper's objective (section 2.4) of one pair, with the network as training runs it."""
+        model = Model(self.training_network(), variables["params"])
+        source, target, frame = normalize_pair(pair.source, pair.target)
+        answer = estimate_subsampled(model, source, target)
+        distances = alignment_losses(self, pair, frame, answer.steps)
+        loss, metrics = jnp.mean(distances), {"chamfer": distances[-1], "chamfer_first": distances[0]}
+        if self.model.has_regions:
+            occupancy, found = occupancy_of_target(self, model, pair, frame, answer, key)
+            loss, metrics = loss + self.occupancy_weight * occupancy, metrics | found
+            if self.model.partition == "parts":
+                whole = shift(pair.whole_target, frame.target_center, frame.scale)
+                agreement = region_agreement(self, model, whole, jax.random.fold_in(key, 1))
+                loss = loss - self.occupancy_weight * self.agreement_weight * agreement
+                metrics |= {"agreement": agreement}
         return loss, metrics, {}
 
     def evaluate(self, variables: Variables, pair: Pair, key: Array) -> tuple[Array, Rigid]:
         """The Chamfer distance after the last step of the whole network, which needs no labels, and its transform."""
-        model = self.as_model(variables)
-        _, metrics = pair_loss(model, pair, key, self)
-        return metrics["chamfer"], predict(model, pair.source, pair.target)
+        source, target, frame = normalize_pair(pair.source, pair.target)
+        answer = estimate_subsampled(self.as_model(variables), source, target)
+        return alignment_losses(self, pair, frame, answer.steps)[-1], frame.leave(answer.transform)
 
     def training_network(self) -> ModelConfig:
         """The network as training runs it: the parameters are the same, but it does less."""
@@ -85,38 +105,77 @@ class URRT(Trainable):
         return Model(self.model, variables["params"])
 
 
-def pair_loss(model: Model, pair: Pair, key: Array, method: URRT) -> tuple[Array, Metrics]:
-    """The objective of one pair, (), and its parts: the paper's section 2.4. It never reads ``pair.transform``.
+def alignment_losses(method: URRT, pair: Pair, frame: Frame, steps: Rigid) -> Array:
+    """The Chamfer distance (K,) after every step, of the whole source, moved, and the whole target.
 
-    Alignment is the Chamfer distance between the whole source, moved by the estimate of every step, and the whole
-    target, averaged over the steps; the network itself sees the corrupted clouds. Occupancy is asked of the target.
+    The network itself has seen the corrupted clouds. The true pose of the pair is not read.
     """
-    source, target, frame = normalize_pair(pair.source, pair.target)
-    result = estimate_subsampled(model, source, target)
-
-    whole_source = first(shift(pair.whole_source, frame.source_center, frame.scale), method.loss_points)
-    whole_target = first(shift(pair.whole_target, frame.target_center, frame.scale), method.loss_points)
+    source, target = whole_clouds(method, pair, frame)
 
     def aligned(transform: Rigid) -> Array:
-        moved = whole_source._replace(points=rigid.apply(transform, whole_source.points))
-        return chamfer(moved, whole_target, penalty="distance", scale=method.chamfer_scale)
+        moved = source._replace(points=rigid.apply(transform, source.points))
+        return chamfer(moved, target, penalty="distance", scale=method.chamfer_scale)
 
-    alignment = jax.vmap(aligned)(result.steps)
-    metrics = {"chamfer": alignment[-1], "chamfer_first": alignment[0]}
-    loss = jnp.mean(alignment)
-    if method.model.has_regions:
-        if pair.queries is None or pair.inside is None:
-            queries, inside = shell_samples(key, whole_target, method.occupancy_queries)
-        else:
-            rows = jax.random.choice(key, pair.queries.shape[0], (method.occupancy_queries,))
-            queries, inside = (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
-        logits = branch_logits(method.model, model.params["partition"], queries, result.target.embedding)
-        occupancy = occupancy_loss(occupancy_logits(logits), inside)
-        counts = result.target.regions.counts
-        metrics |= {
-            "occupancy": occupancy,
-            "occupancy_accuracy": jnp.mean((occupancy_logits(logits) > 0) == inside),
-            "regions_used": jnp.sum(counts > 0.01 * jnp.sum(counts)).astype(jnp.float32),
-        }
-        loss = loss + method.occupancy_weight * occupancy
-    return loss, metrics
+    return jax.vmap(aligned)(steps)
+
+
+def whole_clouds(method: URRT, pair: Pair, frame: Frame) -> tuple[Cloud, Cloud]:
+    """Source and target before corruption, in the network's frame, thinned to what the losses compare."""
+    return (
+        first(shift(pair.whole_source, frame.source_center, frame.scale), method.loss_points),
+        first(shift(pair.whole_target, frame.target_center, frame.scale), method.loss_points),
+    )
+
+
+def occupancy_of_target(
+    method: URRT, model: Model, pair: Pair, frame: Frame, answer: Estimate, key: Array
+) -> tuple[Array, Metrics]:
+    """The loss of occupancy, asked of the target, () and what is worth a line in the log."""
+    if pair.queries is None or pair.inside is None:
+        queries, inside = shell_samples(key, whole_clouds(method, pair, frame)[1], method.occupancy_queries)
+    else:
+        rows = jax.random.choice(key, pair.queries.shape[0], (method.occupancy_queries,))
+        queries, inside = (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
+    seen = see_places(model.config, answer.target.cloud, queries, answer.target.shape)
+    logits = occupancy_logits(branch_logits(model.config, model.params["partition"], seen))
+    counts = answer.target.regions.counts
+    loss = occupancy_loss(logits, inside)
+    return loss, {
+        "occupancy": loss,
+        "occupancy_accuracy": jnp.mean((logits > 0) == inside),
+        "regions_used": jnp.sum(counts > 0.01 * jnp.sum(counts)).astype(jnp.float32),
+    }
+
+
+def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Array:
+    """How far the regions of corresponding points tell each other, (), in nats: the mean of this cloud and its batch.
+
+    Points of two samples of the cloud correspond that are neighbours. Both samples have noise of their own and one of
+    them is often cropped, as in training pairs (``PairConfig``); they are in one pose, so that none needs to be known.
+    The batch is that of the ``vmap`` whose axis is ``PAIRS``.
+
+    Args:
+      method: what is trained.
+      model: the network.
+      cloud: N points, in the network's frame, from which the samples are drawn.
+      key: random key.
+    """
+    order, one_noise, other_noise, level, place, keep, often = jax.random.split(key, 7)
+    rows = jax.random.permutation(order, cloud.mask.shape[0])
+    count = min(model.config.points, cloud.mask.shape[0] // 2)
+    one, other = (jax.tree.map(lambda leaf: leaf[chosen], cloud) for chosen in (rows[:count], rows[-count:]))  # noqa: B023
+    sigma = jax.random.uniform(level, maxval=_NOISE)
+    share = jnp.where(jax.random.bernoulli(often), jax.random.uniform(keep, minval=_KEEP), 1.0)
+    one, other = add_noise(one_noise, one, sigma), crop(place, add_noise(other_noise, other, sigma), share)
+    scores = [_sample_scores(model, each) for each in (one, other)]
+    found = nearest(one.points, other)
+    weights = jnp.where(one.mask, jnp.exp(-found.squared / method.chamfer_scale**2), 0.0)
+    pairs = region_pairs(scores[0], scores[1][found.index], weights)
+    return (mutual_information(pairs) + mutual_information(jax.lax.pmean(pairs, PAIRS))) / 2
+
+
+def _sample_scores(model: Model, cloud: Cloud) -> Array:
+    """The scores (N, n) of the regions of a cloud whose branches see surroundings."""
+    invariants = moment_invariants(cloud, model.config.octaves)
+    seen = see_cloud(model.config, cloud, jnp.zeros(model.config.width), invariants)
+    return region_scores(branch_logits(model.config, model.params["partition"], seen))

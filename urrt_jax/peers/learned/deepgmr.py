@@ -11,8 +11,9 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, centroid
+from urrt_jax.maxima import masked_max
 from urrt_jax.peers.learned.invariants import centred_features
-from urrt_jax.peers.learned.layers import Layer, masked_max
+from urrt_jax.peers.learned.layers import Layer
 from urrt_jax.peers.learned.network import Network
 from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair

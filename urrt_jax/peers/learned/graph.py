@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud
+from urrt_jax.maxima import masked_max
 from urrt_jax.neighbors import k_nearest, top_rows
-from urrt_jax.peers.learned.layers import Layer, masked_max
+from urrt_jax.peers.learned.layers import Layer
 
 
 def neighbor_rows(features: Array, mask: Array, k: int) -> Array:

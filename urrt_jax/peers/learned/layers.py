@@ -1,6 +1,4 @@
-"""The layers that learned peers share: batch and group norm, layers applied to each point, and masked maxima."""
-
-import functools
+"""The layers that learned peers share: batch and group norm, and dense layers with them, applied to each point."""
 
 import flax.linen as nn
 import jax
@@ -137,30 +135,3 @@ class Layer(nn.Module):
         features = nn.Dense(self.width, use_bias=self.bias)(features)
         features = BatchNorm()(features, mask, training)
         return jnp.where(features > 0, features, self.slope * features)
-
-
-def masked_max(features: Array, mask: Array, axis: int = 0) -> Array:
-    """The maximum over the real rows along an axis; ``mask`` has the shape of ``features`` without the last axis.
-
-    Its derivative goes to one row. That of ``jnp.max`` goes to the rows that equal the maximum, and is wrong where the
-    compiler computes them a second time with another rounding.
-    """
-    return _largest(jnp.where(mask[..., None], features, -jnp.inf), axis)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _largest(features: Array, axis: int) -> Array:
-    return jnp.max(features, axis=axis)
-
-
-@_largest.defjvp
-def _largest_jvp(axis: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    (features,), (tangent,) = primals, tangents
-    largest = jnp.argmax(features, axis=axis, keepdims=True)
-    rows = jax.lax.broadcasted_iota(largest.dtype, features.shape, axis % features.ndim)
-
-    def chosen(values: Array) -> Array:
-        return jnp.sum(jnp.where(rows == largest, values, 0.0), axis=axis)
-
-    # The value comes from the same rows: computing the maximum, too, would take longer.
-    return chosen(features), chosen(tangent)

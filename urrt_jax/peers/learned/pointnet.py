@@ -4,7 +4,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
-from urrt_jax.peers.learned.layers import Layer, masked_max
+from urrt_jax.maxima import masked_max
+from urrt_jax.peers.learned.layers import Layer
 
 
 class PointNet(nn.Module):

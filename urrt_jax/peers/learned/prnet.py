@@ -11,9 +11,10 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
+from urrt_jax.maxima import masked_max
 from urrt_jax.neighbors import top_rows
 from urrt_jax.peers.learned.graph import neighbor_edges
-from urrt_jax.peers.learned.layers import Layer, masked_max
+from urrt_jax.peers.learned.layers import Layer
 from urrt_jax.peers.learned.matching import hard_matches, scaled_products, soft_targets
 from urrt_jax.peers.learned.network import Network, pose_loss
 from urrt_jax.peers.learned.transformer import Transformer

@@ -1,11 +1,11 @@
 """RIENet's objective, which needs no true pose: what one pass of it is judged by (Shen et al. 2022, section 3.4)."""
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
+from urrt_jax.maxima import maximum
 from urrt_jax.neighbors import nearest, top_rows
 from urrt_jax.rigid import Rigid
 
@@ -61,7 +61,4 @@ def match_loss(matches: Array, real: Array) -> Array:
       matches: (K, M), the rows of the keypoints.
       real: (K,) bool.
     """
-    # Not jnp.max: see masked_max for its derivative.
-    likeliest = jnp.argmax(jax.lax.stop_gradient(matches), axis=1, keepdims=True)
-    likely = jnp.take_along_axis(matches, likeliest, axis=1)[:, 0]
-    return -jnp.sum(jnp.where(real, jnp.log(likely + _TINY), 0.0)) / jnp.maximum(jnp.sum(real), 1)
+    return -jnp.sum(jnp.where(real, jnp.log(maximum(matches, 1) + _TINY), 0.0)) / jnp.maximum(jnp.sum(real), 1)

@@ -11,8 +11,9 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, centroid, normals
+from urrt_jax.maxima import masked_max
 from urrt_jax.peers.learned.invariants import point_pair_features, rows_within
-from urrt_jax.peers.learned.layers import GroupNorm, masked_max
+from urrt_jax.peers.learned.layers import GroupNorm
 from urrt_jax.peers.learned.matching import soft_targets
 from urrt_jax.peers.learned.network import Network
 from urrt_jax.peers.learned.sinkhorn import sinkhorn
