@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud
+from urrt_jax.features.moments import invariant_count
 from urrt_jax.maxima import masked_max
 from urrt_jax.model.blocks import Perceptron, run
 from urrt_jax.model.config import ModelConfig
@@ -30,7 +31,16 @@ def shape_embedding(features: Array, mask: Array) -> Array:
     return jnp.where(jnp.any(mask), masked_max(features, mask), 0.0)
 
 
+def point_inputs(config: ModelConfig) -> int:
+    """How many numbers the encoder reads of a point: coordinates, and for landmarks the surroundings' invariants.
+
+    Poses are regressed from coordinates alone: with invariants that is learned many times more slowly.
+    """
+    return 3 + (invariant_count(config.octaves) if config.decoder == "landmarks" else 0)
+
+
 def encode_points(config: ModelConfig, params: dict, cloud: Cloud, invariants: Array) -> tuple[Array, Array]:
     """Point embeddings (N, d) and the shape embedding e (d,) of a normalised cloud."""
-    features = run(PointEncoder(config), params, jnp.concatenate([cloud.points, invariants], axis=1))
+    described = jnp.concatenate([cloud.points, invariants], axis=1)[:, : point_inputs(config)]
+    features = run(PointEncoder(config), params, described)
     return features, shape_embedding(features, cloud.mask)

@@ -13,13 +13,13 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, subsample
-from urrt_jax.features.moments import invariant_count, moment_invariants
+from urrt_jax.features.moments import moment_invariants
 from urrt_jax.frames import normalize_pair
 from urrt_jax.loops import each_cloud
 from urrt_jax.model.attention import RegionTransformer
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.decoder import decode, decode_hypotheses, init_decoder
-from urrt_jax.model.encoder import PointEncoder
+from urrt_jax.model.encoder import PointEncoder, point_inputs
 from urrt_jax.model.encoding import Encoding, encode_cloud
 from urrt_jax.model.partition import init_branches
 from urrt_jax.neighbors import nearest
@@ -62,8 +62,7 @@ def init_model(key: Array, config: ModelConfig) -> Model:
     """A model with fresh parameters drawn from ``key``."""
     keys = jax.random.split(key, 4)
     n, d = config.regions, config.width
-    described = jnp.zeros((1, 3 + invariant_count(config.octaves)))
-    params = {"encoder": PointEncoder(config).init(keys[0], described)["params"]}
+    params = {"encoder": PointEncoder(config).init(keys[0], jnp.zeros((1, point_inputs(config))))["params"]}
     if config.has_regions:
         sequence = jnp.zeros((n, d)), jnp.zeros((n, 3)), jnp.ones(n, bool)
         params["partition"] = init_branches(config, keys[1])
