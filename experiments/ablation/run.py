@@ -1,32 +1,30 @@
-"""The paper's ablation: do regions pay? Models A, B and C, trained for the same time with three seeds each.
+"""The paper's ablation: models A, B and C trained alike, three seeds each, one step, without refinement.
 
-    python experiments/ablation/run.py --data PATH [--only NAME ...]
+    python experiments/ablation/run.py --data PATH [--decoder landmarks pose]
 
-A has one decoder for the whole shape. B has regions, attention between them and a decoder for each region. C is B with
-a position encoding of the regions' centroids. They are compared with either kind of decoder:
+Training pairs follow DCP's clean protocol, as in the paper, and every model sees the same ones. The models are compared
+with either kind of decoder:
 
-* landmarks: the network that the package uses, trained on its usual mixture of clean and corrupted pairs. Model A,
-  which has no regions, has as many landmarks as the regions of the others together. C is also trained with the
-  paper's regions, which depend on where points lie ("places").
-* pose: decoders regress the pose, as the paper may mean it. One step, trained on clean pairs, as in the paper.
+* pose: as the paper may mean it. Points are known by their coordinates alone, and decoders regress the pose.
+* landmarks: points see their surroundings, and decoders answer by landmarks, aligned after three rounds of consensus.
+  Points are not looked up, which needs no regions and would hide what they are for. Model A, which has none, has as
+  many landmarks as the regions of the others together.
 
-All models of a kind train for the same time: slower ones for fewer steps. The network alone is measured on every fourth
-test shape, and on all shapes of RPM-Net's protocol; checkpoints are chosen on shapes held out of the training split.
-Runs are kept in runs/ beside this file: an interrupted command continues where it stopped, and commands with other
-names may run beside each other. Writes results.json and table.md beside this file, with the models that are there.
+Checkpoints are chosen on shapes held out of the training split; the table is over all test shapes. Runs are kept in
+runs/ beside this file: an interrupted command continues where it stopped. Writes results.json and table.md beside this
+file.
 """
 
 import argparse
-import dataclasses
+import itertools
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
-from urrt_jax.atomic import write_atomically
 from urrt_jax.data import Shapes, load_shapes
 from urrt_jax.evaluation import evaluate
 from urrt_jax.evaluation.methods import Ours
@@ -38,176 +36,85 @@ from urrt_jax.training.urrt import URRT
 
 HERE = Path(__file__).parent
 SEEDS = (0, 1, 2)
-STRIDE = 4
-PROTOCOLS = {
-    "dcp": "clean",
-    "incomplete_both": "D.I. two-sided",
-    "drift": "P.D.",
-    "outliers": "D.O.",
-    "independent_noise": "independent + noise",
-    "rpmnet": "RPM-Net crops",
+METRICS = ("rmse_rotation", "mae_rotation", "rmse_translation", "mae_translation", "recall_1deg")
+PAPER = {
+    "A": (1.2891, 1.0016, 0.0170, 0.0128),
+    "B": (0.6237, 0.5337, 0.0097, 0.0074),
+    "C": (0.5526, 0.4328, 0.0080, 0.0060),
 }
-PARTIAL = ("incomplete_both", "rpmnet")
-RPMNET = "modelnet40_2048_normals_subset.npz"
-DRAWS = 2000  # of the bootstrap
+Variant = Literal["A", "B", "C"]
+Decoder = Literal["landmarks", "pose"]
+VARIANTS: tuple[Variant, ...] = ("A", "B", "C")
+DECODERS: tuple[Decoder, ...] = ("pose", "landmarks")
 
 
-class Named(NamedTuple):
-    """A model of the table: its kind of decoders, what its network has, and steps that take as long as the others'."""
-
-    decoder: str
-    model: dict[str, Any]
-    steps: int
-
-
-MODELS = {
-    "A": Named("landmarks", {"variant": "A", "landmarks": 64}, 440),
-    "B": Named("landmarks", {"variant": "B", "partition": "parts"}, 400),
-    "C": Named("landmarks", {"variant": "C", "partition": "parts"}, 400),
-    "C, places": Named("landmarks", {"variant": "C", "partition": "places"}, 410),
-    "A, pose": Named("pose", {"variant": "A"}, 2_000),
-    "B, pose": Named("pose", {"variant": "B", "partition": "parts"}, 1_600),
-    "C, pose": Named("pose", {"variant": "C", "partition": "parts"}, 1_600),
-    "C, pose, places": Named("pose", {"variant": "C", "partition": "places"}, 1_800),
-}
-_POSE = {"decoder": "pose", "lookups": 0, "consensus": 0, "hypotheses": 0, "steps": 1, "points": 256}
-
-
-def configured(name: str, seed: int) -> TrainConfig:
-    """How one of the models is trained."""
-    decoder, model, steps = MODELS[name]
-    if decoder == "landmarks":
-        method, pairs, batch = URRT(model=ModelConfig(**model)), PairConfig(ramp_share=0.2), 16
+def configured(variant: Variant, decoder: Decoder, seed: int) -> tuple[URRT, TrainConfig]:
+    """One of the models, and how it is trained."""
+    if decoder == "pose":
+        model = ModelConfig(
+            variant=variant, decoder="pose", octaves=0, lookups=0, consensus=0, hypotheses=0, steps=1, points=256
+        )
+        steps, points, loss_points = 1_500, 512, 256
     else:
-        method = URRT(model=ModelConfig(**model, **_POSE), loss_points=256)
-        pairs, batch = PairConfig(points=512, corrupted=0.0, signed=0.0, both_ways=0.0), 32
-    return TrainConfig(
-        method=method, pairs=pairs, batch=batch, steps=steps, warmup=50, learning_rate=1.5e-3, steps_per_call=10,
+        landmarks = 64 if variant == "A" else 8
+        model = ModelConfig(variant=variant, landmarks=landmarks, lookups=0, consensus=3, hypotheses=0, steps=1)
+        steps, points, loss_points = 300, 1024, 512
+    method = URRT(model=model, loss_points=loss_points)
+    return method, TrainConfig(
+        method=method,
+        pairs=PairConfig(points=points, corrupted=0.0, signed=0.0, both_ways=0.0),
+        steps=steps,
+        steps_per_call=10,
         seed=seed,
-    )  # fmt: skip
+    )
 
 
-def folder(name: str, seed: int) -> Path:
-    """Where a model's run is kept."""
-    return HERE / "runs" / f"{name.replace(', ', '_')}_{seed}"
+def measured(variant: Variant, decoder: Decoder, shapes: Shapes, test: Shapes) -> dict[str, Any]:
+    """The row of one model: its figures over all test shapes, for every seed."""
+    found, configs = [], [configured(variant, decoder, seed) for seed in SEEDS]
+    for method, config in configs:
+        held_in, held_out = shapes.split_validation(0.05, config.seed)
+        run = HERE / "runs" / f"{variant}_{decoder}_{config.seed}_{config.steps}"
+        variables = train(config, held_in, held_out, run, loop=LoopConfig(every=config.steps // 2))
+        ours = Ours(model=method.as_model(variables), refine=None)
+        found.append(evaluate(ours, "dcp", test.points, progress=False).summary())
+    values = {name: [one[name] for one in found] for name in METRICS}
+    return {"variant": variant, "decoder": decoder, "steps": configs[0][1].steps} | values
 
 
-def trained(name: str, seed: int, shapes: Shapes) -> tuple[Ours, float]:
-    """The network of a model, trained if its run is not there yet, and the seconds that its training took."""
-    config = configured(name, seed)
-    held_in, held_out = shapes.split_validation(0.05, seed)
-    run = folder(name, seed)
-    variables = train(config, held_in, held_out, run, loop=LoopConfig(every=config.steps, validation_pairs=64))
-    log = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    model = config.method.as_model(variables)
-    return Ours(model=model, refine=None, name=name), max(entry.get("seconds", 0.0) for entry in log)
-
-
-def angles(ours: Ours, data: dict[str, np.ndarray], run: Path) -> dict[str, list[float]]:
-    """The error of every item in degrees, by protocol."""
-    found = {}
-    for protocol in tqdm(PROTOCOLS, desc=ours.name, unit="protocol"):
-        points = data["rpmnet" if protocol == "rpmnet" else "others"]
-        items = np.arange(0, len(points), 1 if protocol == "rpmnet" else STRIDE)
-        save = run / f"{protocol}.npz"
-        found[protocol] = evaluate(ours, protocol, points, items=items, save=save, progress=False).errors()["angle"]
-    return {protocol: np.round(values, 4).tolist() for protocol, values in found.items()}
-
-
-def ratio(first: list[list[float]], second: list[list[float]]) -> tuple[float, float, float]:
-    """The mean error of the first model over that of the second, and its 95 % interval.
-
-    Args:
-      first: (seeds, items), errors.
-      second: the same of the other model, on the same items.
-
-    Returns:
-      The ratio, and the bounds of a bootstrap over seeds, of either model for itself, and items, of both alike.
-    """
-    one, other, draw = np.asarray(first), np.asarray(second), np.random.default_rng(0)
-    ratios = []
-    for _ in range(DRAWS):
-        items = draw.integers(0, one.shape[1], one.shape[1])
-        sums = [each[draw.integers(0, len(each), len(each))][:, items].mean() for each in (one, other)]
-        ratios.append(sums[0] / sums[1])
-    low, high = np.quantile(ratios, [0.025, 0.975])
-    return float(one.mean() / other.mean()), float(low), float(high)
-
-
-def as_markdown(rows: list[dict[str, Any]]) -> str:
-    """Mean errors and their deviation over the seeds, then each model with regions against A of its kind."""
-    titles = " | ".join(PROTOCOLS.values())
-    lines = [f"| mean error | steps | {titles} |", "|---|---:|" + "---:|" * len(PROTOCOLS)]
-    for row in rows:
-        means = {protocol: np.mean(each, axis=1) for protocol, each in row["angles"].items()}
-        cells = [f"{each.mean():.2f}° ± {each.std(ddof=1) if len(each) > 1 else 0:.2f}" for each in means.values()]
-        lines.append(f"| {row['model']} | {row['steps']:,} | " + " | ".join(cells) + " |")
-    lines += ["", f"| error, model A = 1 | {titles} |", "|---|" + "---:|" * len(PROTOCOLS)]
-    plain = {row["decoder"]: row for row in rows if MODELS[row["model"]].model["variant"] == "A"}
-    for row in rows:
-        base = plain.get(row["decoder"])
-        if base is None or base is row:
-            continue
+def as_markdown(results: dict[str, Any]) -> str:
+    """The models' means and deviations over the seeds, and the paper's figures."""
+    lines = ["| model, one step | RMSE(R) | MAE(R) | RMSE(t) | MAE(t) | within 1° |", "|---|---:|---:|---:|---:|---:|"]
+    for row in results["rows"]:
         cells = []
-        for protocol in PROTOCOLS:
-            middle, low, high = ratio(row["angles"][protocol], base["angles"][protocol])
-            cells.append(f"{middle:.2f} ({low:.2f} to {high:.2f})")
-        lines.append(f"| {row['model']} | " + " | ".join(cells) + " |")
+        for name in METRICS:
+            values, digits = np.array(row[name]), 4 if name.endswith("translation") else 3
+            unit = "°" if name.endswith("rotation") else ""
+            cells.append(f"{values.mean():.{digits}f}{unit} ± {values.std(ddof=1):.{digits}f}")
+        lines.append(f"| {row['variant']}, {row['decoder']}, {row['steps']:,} steps | " + " | ".join(cells) + " |")
+    for variant, (rmse, mae, rmse_t, mae_t) in PAPER.items():
+        lines.append(f"| *{variant} (paper)* | *{rmse:.3f}°* | *{mae:.3f}°* | *{rmse_t:.4f}* | *{mae_t:.4f}* | |")
     return "\n".join(lines) + "\n"
-
-
-def keep(row: dict[str, Any], seed: int, data: str) -> list[dict[str, Any]]:
-    """Writes what one model with one seed has reached beside what is there, and returns all rows in order."""
-    written = HERE / "results.json"
-    command = f"python experiments/ablation/run.py --data {data}"
-    before = json.loads(written.read_text()) if written.exists() else {}
-    # Read only now: commands may run side by side. Rows of other data or another training would not compare.
-    rows = {each["model"]: each for each in before.get("rows", []) if before.get("command") == command}
-    old = rows.get(row["model"])
-    if old is not None and old["training"] == row["training"]:
-        seeds = sorted({*old["seeds"], seed})
-        for name in ("angles", "seconds"):
-            row[name] = _merged(old[name], old["seeds"], row[name], seed, seeds)
-        row["seeds"] = seeds
-    rows[row["model"]] = row
-    ordered = [rows[name] for name in MODELS if name in rows]
-    write_atomically(written, json.dumps({"command": command, "jax": jax.__version__, "rows": ordered}) + "\n")
-    write_atomically(HERE / "table.md", as_markdown(ordered))
-    return ordered
-
-
-def _merged(old: Any, old_seeds: list[int], new: Any, seed: int, seeds: list[int]) -> Any:
-    """Values by seed, those of ``seed`` taken from the new ones; of every protocol where they are by protocol."""
-    if isinstance(new, dict):
-        return {name: _merged(old[name], old_seeds, new[name], seed, seeds) for name in new}
-    values = dict(zip(old_seeds, old, strict=True)) | {seed: new[0]}
-    return [values[each] for each in seeds]
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it, and RPM-Net's shapes")
-    parser.add_argument("--only", nargs="+", default=list(MODELS), help="names of models", metavar="NAME")
-    parser.add_argument("--seeds", nargs="+", type=int, choices=SEEDS, default=SEEDS, help="seeds of the training")
+    parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
+    parser.add_argument("--decoder", nargs="+", choices=DECODERS, default=DECODERS, help="what decoders give")
     flags = parser.parse_args()
-    if unknown := sorted(set(flags.only) - set(MODELS)):
-        parser.error(f"no models {unknown}; there are {list(MODELS)}")
-    shapes = load_shapes(flags.data, points=1024)
-    clouds = {
-        "others": load_shapes(flags.data, split="test", points=1024).points,
-        "rpmnet": load_shapes(str(Path(flags.data) / RPMNET), split="test", points=2048).points,
-    }
-    for seed in flags.seeds:
-        for name in flags.only:
-            ours, seconds = trained(name, seed, shapes)
-            row = {
-                "model": name,
-                "decoder": MODELS[name].decoder,
-                "steps": MODELS[name].steps,
-                "training": json.loads(json.dumps(dataclasses.replace(configured(name, seed), seed=0).as_dict())),
-                "seeds": [seed],
-                "seconds": [round(seconds, 1)],
-                "angles": {protocol: [each] for protocol, each in angles(ours, clouds, folder(name, seed)).items()},
+    shapes, test = load_shapes(flags.data, points=1024), load_shapes(flags.data, split="test", points=1024)
+    written = HERE / "results.json"
+    before = json.loads(written.read_text())["rows"] if written.exists() else []
+    rows = {(row["decoder"], row["variant"]): row for row in before}
+    for decoder in flags.decoder:
+        for variant in tqdm(VARIANTS, desc=decoder, unit="model"):
+            rows[decoder, variant] = measured(variant, decoder, shapes, test)
+            results = {
+                "command": f"python experiments/ablation/run.py --data {Path(flags.data).name}",
+                "jax": jax.__version__,
+                "seeds": SEEDS,
+                "rows": [rows[each] for each in itertools.product(DECODERS, VARIANTS) if each in rows],
             }
-            jax.clear_caches()  # programs of many models would be too much for the compiler's memory
-            print(as_markdown(keep(row, seed, Path(flags.data).name)))
+            written.write_text(json.dumps(results, indent=1) + "\n")
+            (HERE / "table.md").write_text(as_markdown(results))
+    print((HERE / "table.md").read_text())

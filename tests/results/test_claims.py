@@ -177,7 +177,7 @@ def _kind(name: str) -> dict:
 
 def test_regions_are_used_and_agree_between_both_clouds():
     numbers = load("regions")["numbers"]
-    assert numbers["consistency in the last step"] >= 0.8
+    assert numbers["consistency in the last step, clean"] >= 0.8
     assert numbers["regions with more than 1 % of all points"] >= 5
 
 

@@ -194,8 +194,9 @@ RESULTS = (
     f"{_SPEED['FGR + ICP (Open3D)'] / _BATCHED:.1f} times as fast as FGR with ICP",
     f"{_BATCHED / _SPEED['ICP from the centroids (Open3D)']:.1f} times as fast as `register` in batches",
     f"takes {_SPEED['scans of 40,000 points: register with search'] / _SPEED[_RANSAC]:.1f} times as long as RANSAC",
-    f"of corresponding points, {100 * _REGIONS['consistency in the last step']:.0f} % have the same region once the "
-    f"clouds are nearly aligned, but only {100 * _REGIONS['consistency before alignment']:.0f} % before",
+    f"of corresponding points, {100 * _REGIONS['consistency in the last step, clean']:.0f} % have the same region once "
+    f"the clouds are nearly aligned, but only {100 * _REGIONS['consistency before alignment, clean']:.0f} % before, "
+    f"and {100 * _REGIONS['consistency before alignment, D.I. two-sided']:.0f} % where both clouds are cropped",
     f"{_REGIONS['regions with more than 1 % of all points']:.0f} of the 8 regions hold more than 1 %",
     f"by at most {max(_gains_in_the_grid().values()):.3f}",
     f"{len(load('trials')['rows'])} changes of the network",

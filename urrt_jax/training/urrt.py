@@ -17,11 +17,10 @@ from urrt_jax.model.network import Estimate, estimate_subsampled
 from urrt_jax.model.partition import branch_logits, occupancy_logits, region_scores, see_cloud, see_places
 from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
-from urrt_jax.training.pairs import Pair, add_noise, crop
+from urrt_jax.training.pairs import Pair, add_noise
 from urrt_jax.training.trainable import PAIRS, Metrics, Trainable, Variables
 
-# Of the samples whose regions are to agree: largest deviation of the noise, smallest share that a crop keeps.
-_NOISE, _KEEP = 0.03, 0.5
+_NOISE = 0.03  # largest deviation of the noise of samples whose regions are to agree, in the network's frame
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -150,9 +149,9 @@ def occupancy_of_target(
 def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Array:
     """How far the regions of corresponding points tell each other, (), in nats: the mean of this cloud and its batch.
 
-    Points of two samples of the cloud correspond that are neighbours. Both samples have noise of their own and one of
-    them is often cropped, as in training pairs (``PairConfig``); they are in one pose, so that none needs to be known.
-    The batch is that of the ``vmap`` whose axis is ``PAIRS``.
+    Points of two samples of the cloud correspond that are neighbours. The samples share no point and have noise of
+    their own; they are in one pose, so that none needs to be known. The batch is that of the ``vmap`` whose axis is
+    ``PAIRS``.
 
     Args:
       method: what is trained.
@@ -160,13 +159,14 @@ def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Ar
       cloud: N points, in the network's frame, from which the samples are drawn.
       key: random key.
     """
-    order, one_noise, other_noise, level, place, keep, often = jax.random.split(key, 7)
+    order, level, *noises = jax.random.split(key, 4)
     rows = jax.random.permutation(order, cloud.mask.shape[0])
     count = min(model.config.points, cloud.mask.shape[0] // 2)
-    one, other = (jax.tree.map(lambda leaf: leaf[chosen], cloud) for chosen in (rows[:count], rows[-count:]))  # noqa: B023
     sigma = jax.random.uniform(level, maxval=_NOISE)
-    share = jnp.where(jax.random.bernoulli(often), jax.random.uniform(keep, minval=_KEEP), 1.0)
-    one, other = add_noise(one_noise, one, sigma), crop(place, add_noise(other_noise, other, sigma), share)
+    one, other = (
+        add_noise(noise, jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], cloud), sigma)
+        for noise, chosen in zip(noises, (rows[:count], rows[-count:]), strict=True)
+    )
     scores = [_sample_scores(model, each) for each in (one, other)]
     found = nearest(one.points, other)
     weights = jnp.where(one.mask, jnp.exp(-found.squared / method.chamfer_scale**2), 0.0)

@@ -1,0 +1,70 @@
+"""The objective of our own network: what agreement of regions is told, and that no true pose is read."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from urrt_jax import rigid
+from urrt_jax.clouds import make_cloud
+from urrt_jax.model import Model
+from urrt_jax.rigid import Rigid
+from urrt_jax.training.pairs import PairConfig, make_pair
+from urrt_jax.training.trainable import PAIRS
+from urrt_jax.training.urrt import URRT, region_agreement
+
+
+@pytest.fixture(scope="module")
+def parts(small_config, make_model) -> Model:
+    return make_model(dataclasses.replace(small_config, partition="parts"))
+
+
+def _agreement(model: Model, clouds: np.ndarray) -> jax.Array:
+    """Of a batch of whole clouds (B, N, 3)."""
+    method = URRT(model=model.config)
+    one = lambda points, key: region_agreement(method, model, make_cloud(points), key)  # noqa: E731
+    return jax.jit(jax.vmap(one, axis_name=PAIRS))(clouds, jax.random.split(jax.random.key(0), len(clouds)))
+
+
+@pytest.fixture(scope="module")
+def clouds(cloud) -> np.ndarray:
+    return np.stack([cloud - cloud.mean(axis=0), 0.5 * cloud[:, ::-1]])
+
+
+def test_agreement_is_between_nothing_and_what_n_regions_can_tell(parts, clouds):
+    found = np.asarray(_agreement(parts, clouds))
+    assert np.all(found > -1e-3) and np.all(found < np.log(parts.config.regions))
+
+
+def test_sharper_regions_tell_more(parts, clouds):
+    partition = parts.params["partition"] | {
+        "Dense_3": jax.tree.map(lambda leaf: 5 * leaf, parts.params["partition"]["Dense_3"])
+    }
+    sharper = Model(parts.config, parts.params | {"partition": partition})
+    assert float(jnp.mean(_agreement(sharper, clouds))) > float(jnp.mean(_agreement(parts, clouds)))
+
+
+def test_agreement_does_not_depend_on_the_pose(parts, clouds, pose, monkeypatch):
+    """Without noise, which has directions of its own."""
+    monkeypatch.setattr("urrt_jax.training.urrt._NOISE", 0.0)
+    still, turned = (_agreement(parts, clouds @ turn.T) for turn in (np.eye(3, dtype=np.float32), pose[0]))
+    np.testing.assert_allclose(turned, still, atol=1e-4)
+
+
+@pytest.mark.parametrize("partition", ["places", "parts"])
+def test_no_loss_reads_the_true_pose(small_config, make_model, cloud, partition):
+    model = make_model(dataclasses.replace(small_config, partition=partition))
+    method = URRT(model=model.config, loss_points=64, occupancy_queries=64)
+    batch = jax.vmap(lambda key: make_pair(key, jnp.asarray(cloud), PairConfig(points=64), 1.0))(
+        jax.random.split(jax.random.key(0), 2)
+    )
+    wrong = jax.vmap(rigid.inverse)(jax.tree.map(lambda leaf: leaf[::-1], batch.transform))
+
+    @jax.jit
+    def losses(transform: Rigid) -> jax.Array:
+        one = lambda pair: method.loss({"params": model.params}, pair, jax.random.key(1))[0]  # noqa: E731
+        return jax.vmap(one, axis_name=PAIRS)(batch._replace(transform=transform))
+
+    np.testing.assert_array_equal(losses(batch.transform), losses(wrong))
