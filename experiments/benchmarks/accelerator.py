@@ -76,8 +76,8 @@ def batched(pairs: int, shapes: np.ndarray, best: float) -> list[dict[str, Any]]
     for name, function in {"network alone": network, "register": refined}.items():
         for batch in sorted({*(each for each in BATCHES if each < pairs), pairs}):
             clouds = jax.device_put((source[:batch], target[:batch]))
-            row, found = timed(f"{name}, a batch of {batch:,}", jax.vmap(function), clouds, batch, best)
-            errors = pose_errors(*map(np.asarray, found), rotation[:batch], translation[:batch])
+            row, (turns, moves) = timed(f"{name}, a batch of {batch:,}", jax.vmap(function), clouds, batch, best)
+            errors = pose_errors(np.asarray(turns), np.asarray(moves), rotation[:batch], translation[:batch])
             rows.append(row | {"recall_1deg": round(summarize(errors)["recall_1deg"], 4)})
     return rows
 

@@ -117,12 +117,12 @@ def measure(
     model: Model, points: np.ndarray, stride: int = STRIDE
 ) -> tuple[dict[str, float], Cut, np.ndarray, np.ndarray]:
     """The numbers, and of the clean pairs the labels and the clouds."""
-    numbers, clean = {}, None
-    for protocol, title in PROTOCOLS.items():
-        found, *clouds = cut_all(model, points, protocol, stride)
-        numbers[f"consistency before alignment, {title}"] = consistency(np.asarray(found.source), found)
-        clean = clean or (found, *clouds)
-    found, sources, targets = clean
+    all_found = {protocol: cut_all(model, points, protocol, stride) for protocol in PROTOCOLS}
+    numbers = {
+        f"consistency before alignment, {PROTOCOLS[protocol]}": consistency(np.asarray(found.source), found)
+        for protocol, (found, _, _) in all_found.items()
+    }
+    found, sources, targets = all_found["dcp"]
     shares = np.stack([np.mean(found.target == k, axis=1) for k in range(model.config.regions)], axis=-1)
     numbers = (
         {"pairs": len(sources)}
