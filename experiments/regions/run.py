@@ -27,7 +27,7 @@ from urrt_jax.frames import normalize_pair
 from urrt_jax.losses import shell_samples
 from urrt_jax.model import Model
 from urrt_jax.model.network import encode, estimate_subsampled, point_regions
-from urrt_jax.model.partition import branch_logits, occupancy_logits, see_places
+from urrt_jax.model.partition import branch_logits, inputs_at_places, occupancy_logits
 from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
 from urrt_jax.viewer import region_colors
@@ -77,8 +77,8 @@ def cut(model: Model, sources: Array, targets: Array, rotations: Array, translat
         answer = estimate_subsampled(model, source, target)
         found = nearest(rigid.apply(truth, source.points), target)
         places, inside = shell_samples(jax.random.key(0), first(target, QUERIES * 2), QUERIES)
-        seen = see_places(model.config, answer.target.cloud, places, answer.target.shape)
-        occupancy = occupancy_logits(branch_logits(model.config, model.params["partition"], seen))
+        inputs = inputs_at_places(model.config, answer.target.cloud, places, answer.target.condition)
+        occupancy = occupancy_logits(branch_logits(model.config, model.params["partition"], inputs))
         return Cut(
             source=point_regions(source.points, encode(model, subsample(source, model.config.points))),
             aligned=point_regions(rigid.apply(answer.seen, source.points), answer.source),

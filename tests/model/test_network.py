@@ -19,13 +19,13 @@ from urrt_jax.model.attention import attention_weights
 from urrt_jax.model.encoder import shape_embedding
 from urrt_jax.model.network import encode, point_regions, predict, propose
 from urrt_jax.model.partition import (
-    Seen,
+    BranchInputs,
     branch_logits,
+    inputs_at_places,
     occupancy_logits,
     pool_by_label,
     region_labels,
     region_scores,
-    see_places,
     split_regions,
 )
 from urrt_jax.training.pairs import PairConfig, make_pair
@@ -345,7 +345,9 @@ def test_empty_cloud_leaves_the_answer_finite(model, pair):
 
 def test_labels_are_regions(small_model, pair):
     cloud = make_cloud(pair[0])
-    logits = branch_logits(small_model.config, small_model.params["partition"], Seen(cloud.points, jnp.zeros(16)))
+    logits = branch_logits(
+        small_model.config, small_model.params["partition"], BranchInputs(cloud.points, jnp.zeros(16))
+    )
     labels = region_labels(logits)
     assert labels.dtype == jnp.int32
     assert int(labels.min()) >= 0
@@ -367,7 +369,7 @@ def test_fresh_partition_uses_every_region(small_config):
 
 def test_labels_have_no_derivative(small_model, pair):
     def total(points):
-        logits = branch_logits(small_model.config, small_model.params["partition"], Seen(points, jnp.zeros(16)))
+        logits = branch_logits(small_model.config, small_model.params["partition"], BranchInputs(points, jnp.zeros(16)))
         return jnp.sum(region_labels(logits).astype(jnp.float32))
 
     assert not bool(jnp.any(jax.grad(total)(jnp.asarray(pair[0]))))
@@ -375,8 +377,8 @@ def test_labels_have_no_derivative(small_model, pair):
 
 def test_branches_read_the_direction_of_the_shape_embedding(small_model, pair):
     def logits(embedding):
-        seen = Seen(jnp.asarray(pair[0]), embedding)
-        return branch_logits(small_model.config, small_model.params["partition"], seen)
+        inputs = BranchInputs(jnp.asarray(pair[0]), embedding)
+        return branch_logits(small_model.config, small_model.params["partition"], inputs)
 
     embedding = jax.random.normal(jax.random.key(0), (16,))
     np.testing.assert_allclose(logits(embedding), logits(7 * embedding), atol=1e-4)
@@ -402,8 +404,8 @@ def test_parts_of_a_place_are_those_of_a_point_there(small_config, make_model, p
     config = dataclasses.replace(small_config, partition="parts")
     model, cloud = make_model(config), make_cloud(pair[0], np.arange(60) < 50)
     encoding = _encode(model, cloud)
-    seen = see_places(config, cloud, cloud.points, encoding.shape)
-    scores = region_scores(branch_logits(config, model.params["partition"], seen))
+    inputs = inputs_at_places(config, cloud, cloud.points, encoding.condition)
+    scores = region_scores(branch_logits(config, model.params["partition"], inputs))
     np.testing.assert_allclose(scores[:50], encoding.regions.scores[:50], atol=1e-5)
 
 

@@ -10,7 +10,7 @@ from urrt_jax.model.attention import attend_regions
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.encoder import encode_points
 from urrt_jax.model.landmarks import Lookups, look_up, point_keys
-from urrt_jax.model.partition import Regions, branch_logits, see_cloud, split_regions, whole_region
+from urrt_jax.model.partition import Regions, branch_logits, inputs_of_cloud, split_regions, whole_region
 
 
 class Encoding(NamedTuple):
@@ -19,7 +19,7 @@ class Encoding(NamedTuple):
     Attributes:
       cloud: N points, normalised.
       embedding: (d,), the shape embedding e.
-      shape: what the branches see of the whole cloud (``see_cloud``); e for model A, which has none.
+      condition: what the branches know of the whole cloud (``BranchInputs``); e for model A, which has no branches.
       regions: its regions, with the attended features a; for model A a single one with the shape embedding.
       keys: (N, c), by which landmarks find points; (N, 0) where decoders give poses.
       lookups: its points that are looked up in both clouds, already found in this one.
@@ -27,7 +27,7 @@ class Encoding(NamedTuple):
 
     cloud: Cloud
     embedding: Array
-    shape: Array
+    condition: Array
     regions: Regions
     keys: Array
     lookups: Lookups
@@ -37,13 +37,14 @@ def encode_cloud(config: ModelConfig, params: dict, cloud: Cloud, invariants: Ar
     """The encoding of a normalised cloud of N points with the invariants (N, q) of their surroundings."""
     features, embedding = encode_points(config, params["encoder"], cloud, invariants)
     if config.has_regions:
-        seen = see_cloud(config, cloud, embedding, invariants)
-        shape, regions = seen.shape, split_regions(cloud, features, branch_logits(config, params["partition"], seen))
+        inputs = inputs_of_cloud(config, cloud, embedding, invariants)
+        condition = inputs.condition
+        regions = split_regions(cloud, features, branch_logits(config, params["partition"], inputs))
         regions = regions._replace(features=attend_regions(config, params["attention"], regions))
     else:
-        shape, regions = embedding, whole_region(cloud, embedding)
+        condition, regions = embedding, whole_region(cloud, embedding)
     if config.decoder == "pose":
         keys = jnp.zeros((features.shape[0], 0), features.dtype)
     else:
         keys = point_keys(config, params["decoder"], features, invariants)
-    return Encoding(cloud, embedding, shape, regions, keys, look_up(config, keys, cloud))
+    return Encoding(cloud, embedding, condition, regions, keys, look_up(config, keys, cloud))

@@ -42,16 +42,18 @@ class Regions(NamedTuple):
     centroids: Array
 
 
-class Seen(NamedTuple):
-    """What the branches see.
+class BranchInputs(NamedTuple):
+    """What the branches are given; the size depends on their kind.
 
     Attributes:
-      points: (Q, 3) or (Q, q), of points on the cloud or off it: places, or centred invariants of what surrounds them.
-      shape: (d,) or (2q,), of the whole cloud: its embedding e, or the mean and the maximum of its points' invariants.
+      points: of Q points on the cloud or off it. Place branches: the coordinates x (Q, 3). Part branches: the centred
+        invariants (Q, q) of the surroundings.
+      condition: of the whole cloud, the same for all its points. Place branches: its embedding e (d,). Part branches:
+        the mean and the maximum of its points' invariants (2q,).
     """
 
     points: Array
-    shape: Array
+    condition: Array
 
 
 class PlaceBranches(nn.Module):
@@ -68,7 +70,7 @@ class PlaceBranches(nn.Module):
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, seen: Seen) -> Array:
+    def __call__(self, inputs: BranchInputs) -> Array:
         """Branch logits (Q, n) of points (Q, 3), given the shape embedding (d,)."""
         n, width = self.config.regions, self.config.branch_width
         directions = self.param("directions", _unit_columns, (3, n * width))
@@ -76,12 +78,12 @@ class PlaceBranches(nn.Module):
         faint = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
         # Only e's direction, as long as x: a step of Adam would move the branches farther through e than through x, all
         # shapes would look alike to them, and few regions would stay in use.
-        direction = seen.shape / jnp.sqrt(jnp.sum(seen.shape**2) + 1e-6)
+        direction = inputs.condition / jnp.sqrt(jnp.sum(inputs.condition**2) + 1e-6)
         shape = nn.Dense(n * width, use_bias=False, kernel_init=faint, name="shape")(direction)
         # A unit looking along u rises by |x|/4 on average over all directions u: the sum falls by 4 a unit of length.
         out = self.param("out", nn.initializers.constant(-16.0 / width), (n, width, 1))
         bias = self.param("bias", nn.initializers.constant(2.0), (n,))
-        hidden = nn.leaky_relu(seen.points @ directions + offsets + shape, 0.02)
+        hidden = nn.leaky_relu(inputs.points @ directions + offsets + shape, 0.02)
         # One product with a block-diagonal matrix: n small ones are slower on every device tried.
         return hidden @ jax.scipy.linalg.block_diag(*out) + bias
 
@@ -96,12 +98,12 @@ class PartBranches(nn.Module):
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, seen: Seen) -> Array:
+    def __call__(self, inputs: BranchInputs) -> Array:
         """Branch logits (Q, n) of the invariants (Q, q) of points, given those of the whole cloud (2q,)."""
         width = 2 * self.config.branch_width
         # Most of what a fresh network sees of the shape is the same for all its points, and must not decide alone.
         faint = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
-        hidden = nn.Dense(width)(seen.points) + nn.Dense(width, use_bias=False, kernel_init=faint)(seen.shape)
+        hidden = nn.Dense(width)(inputs.points) + nn.Dense(width, use_bias=False, kernel_init=faint)(inputs.condition)
         hidden = nn.Dense(width)(nn.leaky_relu(hidden, 0.02))
         return nn.Dense(self.config.regions)(nn.leaky_relu(hidden, 0.02))
 
@@ -128,30 +130,37 @@ def branches(config: ModelConfig) -> nn.Module:
 def init_branches(config: ModelConfig, key: Array) -> dict:
     """Fresh parameters of the branches."""
     q = invariant_count(config.octaves)
-    points, shape = (3, config.width) if config.partition == "places" else (q, 2 * q)
-    return dict(branches(config).init(key, Seen(jnp.zeros((1, points)), jnp.zeros(shape)))["params"])
+    points, condition = (3, config.width) if config.partition == "places" else (q, 2 * q)
+    return dict(branches(config).init(key, BranchInputs(jnp.zeros((1, points)), jnp.zeros(condition)))["params"])
 
 
-def see_cloud(config: ModelConfig, cloud: Cloud, embedding: Array, invariants: Array) -> Seen:
-    """What the branches see of a cloud of N points with the shape embedding (d,) and invariants (N, q)."""
+def inputs_of_cloud(config: ModelConfig, cloud: Cloud, embedding: Array, invariants: Array) -> BranchInputs:
+    """What the branches are given of all points of a cloud.
+
+    Args:
+      config: the network's.
+      cloud: N points.
+      embedding: (d,), its shape embedding e, which place branches are given.
+      invariants: (N, q), of its points' surroundings, which part branches are given.
+    """
     if config.partition == "places":
-        return Seen(cloud.points, jax.lax.stop_gradient(embedding))
+        return BranchInputs(cloud.points, jax.lax.stop_gradient(embedding))
     real, points = cloud.mask[:, None], centred_invariants(invariants, config.octaves)
     mean = jnp.sum(jnp.where(real, points, 0.0), axis=0) / jnp.maximum(jnp.sum(cloud.mask), 1)
     largest = jnp.where(jnp.any(cloud.mask), masked_max(points, cloud.mask), 0.0)
-    return Seen(points, jax.lax.stop_gradient(jnp.concatenate([mean, largest])))
+    return BranchInputs(points, jax.lax.stop_gradient(jnp.concatenate([mean, largest])))
 
 
-def see_places(config: ModelConfig, cloud: Cloud, places: Array, shape: Array) -> Seen:
-    """What the branches see of places (Q, 3) on a cloud or off it, given what they see of the cloud itself."""
+def inputs_at_places(config: ModelConfig, cloud: Cloud, places: Array, condition: Array) -> BranchInputs:
+    """What the branches are given of places (Q, 3) that need not lie on the cloud; ``condition``: the cloud's."""
     if config.partition == "places":
-        return Seen(places, shape)
-    return Seen(centred_invariants(moment_invariants(cloud, config.octaves, places), config.octaves), shape)
+        return BranchInputs(places, condition)
+    return BranchInputs(centred_invariants(moment_invariants(cloud, config.octaves, places), config.octaves), condition)
 
 
-def branch_logits(config: ModelConfig, params: dict, seen: Seen) -> Array:
-    """h_k for all k: (Q, n), of Q points on the cloud or off it; [x, e] of eq. (1) is what the paper's branches see."""
-    return run(branches(config), params, seen)
+def branch_logits(config: ModelConfig, params: dict, inputs: BranchInputs) -> Array:
+    """h_k of eq. (1) for all k: (Q, n), of the inputs of Q points."""
+    return run(branches(config), params, inputs)
 
 
 def region_scores(logits: Array) -> Array:

@@ -14,7 +14,7 @@ from urrt_jax.frames import Frame, normalize_pair
 from urrt_jax.losses import chamfer, mutual_information, occupancy_loss, region_pairs, shell_samples
 from urrt_jax.model import Model, ModelConfig, init_model
 from urrt_jax.model.network import Estimate, estimate_subsampled
-from urrt_jax.model.partition import branch_logits, occupancy_logits, region_scores, see_cloud, see_places
+from urrt_jax.model.partition import branch_logits, inputs_at_places, inputs_of_cloud, occupancy_logits, region_scores
 from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, add_noise
@@ -135,8 +135,8 @@ def occupancy_of_target(
     else:
         rows = jax.random.choice(key, pair.queries.shape[0], (method.occupancy_queries,))
         queries, inside = (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
-    seen = see_places(model.config, answer.target.cloud, queries, answer.target.shape)
-    logits = occupancy_logits(branch_logits(model.config, model.params["partition"], seen))
+    inputs = inputs_at_places(model.config, answer.target.cloud, queries, answer.target.condition)
+    logits = occupancy_logits(branch_logits(model.config, model.params["partition"], inputs))
     counts = answer.target.regions.counts
     loss = occupancy_loss(logits, inside)
     return loss, {
@@ -177,5 +177,5 @@ def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Ar
 def _sample_scores(model: Model, cloud: Cloud) -> Array:
     """The scores (N, n) of the regions of a cloud whose branches see surroundings."""
     invariants = moment_invariants(cloud, model.config.octaves)
-    seen = see_cloud(model.config, cloud, jnp.zeros(model.config.width), invariants)
-    return region_scores(branch_logits(model.config, model.params["partition"], seen))
+    inputs = inputs_of_cloud(model.config, cloud, jnp.zeros(model.config.width), invariants)
+    return region_scores(branch_logits(model.config, model.params["partition"], inputs))
