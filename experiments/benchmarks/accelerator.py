@@ -4,12 +4,12 @@
 
 Pairs follow the clean DCP protocol, 1,024 points, on the test split of PATH (procedural shapes by default). Clouds lie
 in the device's memory before the clock starts, and each figure is the median of a few calls after one that compiles.
-The share of the peak is what the compiled program says it computes, divided by its time and by what one large matrix
-product in float32 reaches on the same device. Writes accelerator.json and accelerator.md beside this file; on a CPU,
-where the command can be tried with fewer pairs, it only prints.
+Pairs beyond the number of shapes use shapes again. Writes accelerator.json and accelerator.md beside this file; on a
+CPU, where the command can be tried with fewer pairs, it only prints.
 """
 
 import argparse
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -31,33 +31,26 @@ from urrt_jax.neighbors import nearest
 HERE = Path(__file__).parent
 REPEATS = 5
 BATCHES = (64, 256, 1024, 4096)
-PRODUCT = 8192  # rows of the matrix product that stands for the peak
 
 
-def peak() -> float:
-    """Floating-point operations a second of one large product of float32 matrices at the default precision."""
-    rows = min(PRODUCT, 2048) if jax.default_backend() == "cpu" else PRODUCT
-    matrix = jnp.ones((rows, rows), jnp.float32)
-    product = jax.jit(jnp.matmul)
-    return 2 * rows**3 / median_seconds(lambda: jax.block_until_ready(product(matrix, matrix)), REPEATS)
-
-
-def timed(name: str, function: Callable, arguments: tuple, count: int, best: float) -> tuple[dict[str, Any], Any]:
-    """The row of a function of ``count`` pairs, and its answer."""
+def timed(
+    name: str, function: Callable, arguments: tuple, count: int, profile: str | None = None
+) -> tuple[dict[str, Any], Any]:
+    """The row of a function of ``count`` pairs, and its answer, of which ``profile`` keeps a profile."""
     compiled = jax.jit(function).lower(*arguments).compile()
     seconds = median_seconds(lambda: jax.block_until_ready(compiled(*arguments)), REPEATS)
-    work = float((compiled.cost_analysis() or {}).get("flops", float("nan")))
     row = {
         "what": name,
         "pairs_per_second": round(count / seconds, 2),
         "milliseconds_a_pair": round(1e3 * seconds / count, 4),
-        "share_of_peak": round(work / seconds / best, 4),
     }
-    return row, compiled(*arguments)
+    with contextlib.nullcontext() if profile is None else jax.profiler.trace(profile):
+        answer = jax.block_until_ready(compiled(*arguments))
+    return row, answer
 
 
-def batched(pairs: int, shapes: np.ndarray, best: float) -> list[dict[str, Any]]:
-    """The network alone and ``register``, in batches of all sizes up to the number of pairs."""
+def batched(pairs: int, shapes: np.ndarray, profile: str | None) -> list[dict[str, Any]]:
+    """The network alone and ``register``, in batches of all sizes; ``profile``: where to keep one of the last batch."""
     model, draw = load_model(), find_protocol("dcp")
     trials = [draw(shapes, item % len(shapes)) for item in tqdm(range(pairs), desc="pairs")]
     source, target, rotation, translation = (
@@ -76,13 +69,14 @@ def batched(pairs: int, shapes: np.ndarray, best: float) -> list[dict[str, Any]]
     for name, function in {"network alone": network, "register": refined}.items():
         for batch in sorted({*(each for each in BATCHES if each < pairs), pairs}):
             clouds = jax.device_put((source[:batch], target[:batch]))
-            row, (turns, moves) = timed(f"{name}, a batch of {batch:,}", jax.vmap(function), clouds, batch, best)
+            kept = profile if batch == pairs and function is refined else None
+            row, (turns, moves) = timed(f"{name}, a batch of {batch:,}", jax.vmap(function), clouds, batch, kept)
             errors = pose_errors(np.asarray(turns), np.asarray(moves), rotation[:batch], translation[:batch])
             rows.append(row | {"recall_1deg": round(summarize(errors)["recall_1deg"], 4)})
     return rows
 
 
-def large(points: int, best: float) -> list[dict[str, Any]]:
+def large(points: int) -> list[dict[str, Any]]:
     """``register`` of one pair of so many points, and its nearest neighbours found by comparing all."""
     cloud = demo_shape(2 * points)
     pair = jax.device_put((cloud[::2], cloud[1::2] + np.float32(0.1)))
@@ -95,14 +89,13 @@ def large(points: int, best: float) -> list[dict[str, Any]]:
         return nearest(one, Cloud(other, jnp.ones(other.shape[0], bool)), block=block).index
 
     return [
-        timed(f"register, one pair of {points:,} points", pose, pair, 1, best)[0],
+        timed(f"register, one pair of {points:,} points", pose, pair, 1)[0],
         *(
             timed(
                 f"nearest neighbours of {points:,} points, {block} at a time",
                 lambda one, other, block=block: neighbors(one, other, block),
                 pair,
                 1,
-                best,
             )[0]
             for block in (16, 64)
         ),
@@ -110,12 +103,12 @@ def large(points: int, best: float) -> list[dict[str, Any]]:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    lines = ["| what | pairs/s | ms a pair | share of peak | recall at 1° |", "|---|---:|---:|---:|---:|"]
+    lines = ["| what | pairs/s | ms a pair | recall at 1° |", "|---|---:|---:|---:|"]
     for row in result["rows"]:
         recall = f"{row['recall_1deg']:.3f}" if "recall_1deg" in row else ""
-        numbers = f"{row['pairs_per_second']:,} | {row['milliseconds_a_pair']:,} | {100 * row['share_of_peak']:.1f} %"
+        numbers = f"{row['pairs_per_second']:,} | {row['milliseconds_a_pair']:,}"
         lines.append(f"| {row['what']} | {numbers} | {recall} |")
-    return "\n".join(lines) + f"\n\n{result['device']}, jax {result['jax']}; peak {result['peak_tflops']:g} TFLOP/s.\n"
+    return "\n".join(lines) + f"\n\n{result['device']}, jax {result['jax']}.\n"
 
 
 if __name__ == "__main__":
@@ -126,12 +119,7 @@ if __name__ == "__main__":
     parser.add_argument("--profile", metavar="DIR", help="keep a profile of the largest batch there, for TensorBoard")
     flags = parser.parse_args()
     shapes = load_shapes(find_data(flags.data), split="test", points=1024, limit=flags.pairs)
-    best = peak()
-    if flags.profile:
-        jax.profiler.start_trace(flags.profile)
-    rows = batched(flags.pairs, shapes.points, best)
-    if flags.profile:
-        jax.profiler.stop_trace()
+    rows = batched(flags.pairs, shapes.points, flags.profile)
     device = jax.devices()[0]
     result = {
         "command": f"python experiments/benchmarks/accelerator.py --data {Path(find_data(flags.data)).name} "
@@ -139,8 +127,7 @@ if __name__ == "__main__":
         "device": device.device_kind,
         "jax": jax.__version__,
         "model_sha256": model_card()["sha256"],
-        "peak_tflops": round(best / 1e12, 2),
-        "rows": rows + large(flags.large, best),
+        "rows": rows + large(flags.large),
     }
     if device.platform != "cpu":
         (HERE / "accelerator.json").write_text(json.dumps(result, indent=1) + "\n")

@@ -11,6 +11,7 @@ that the branches call inside or outside rightly. Writes results.json, table.md 
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -177,7 +178,8 @@ if __name__ == "__main__":
     names = np.asarray(shapes.classes)[shapes.labels][::STRIDE]
     numbers, found, sources, targets = measure(load_model(flags.model or DEFAULT), shapes.points)
     if flags.model:
-        parser.exit(0, as_markdown({"numbers": numbers}))
+        print(as_markdown({"numbers": numbers}))
+        sys.exit()
     results = {
         "command": f"python experiments/regions/run.py --data {Path(flags.data).name}",
         "model_sha256": model_card()["sha256"],

@@ -359,6 +359,7 @@ def test_train_config_refuses_and_names_the_field(fields, says):
         ({"lookups": -1}, "^lookups: .*-1"),
         ({"chamfer_scale": 0.0}, "^chamfer_scale: .*0.0"),
         ({"occupancy_weight": -0.1}, "^occupancy_weight: .*-0.1"),
+        ({"agreement_weight": -0.1}, "^agreement_weight: .*-0.1"),
     ],
 )
 def test_our_method_refuses_and_names_the_field(fields, says):

@@ -33,9 +33,31 @@ def clouds(cloud) -> np.ndarray:
     return np.stack([cloud - cloud.mean(axis=0), 0.5 * cloud[:, ::-1]])
 
 
-def test_agreement_is_between_nothing_and_what_n_regions_can_tell(parts, clouds):
-    found = np.asarray(_agreement(parts, clouds))
-    assert np.all(found > -1e-3) and np.all(found < np.log(parts.config.regions))
+def test_agreement_rises_along_its_gradient(parts, clouds):
+    def total(partition):
+        model = Model(parts.config, parts.params | {"partition": partition})
+        return jnp.mean(_agreement(model, clouds))
+
+    before, gradient = jax.value_and_grad(total)(parts.params["partition"])
+    length = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+    after = total(jax.tree.map(lambda leaf, step: leaf + 0.01 * step / length, parts.params["partition"], gradient))
+    assert float(after - before) == pytest.approx(0.01 * float(length), rel=0.2)
+
+
+@pytest.mark.parametrize("partition", ["places", "parts"])
+def test_loss_is_the_sum_of_its_parts(small_config, make_model, cloud, partition):
+    model = make_model(dataclasses.replace(small_config, partition=partition))
+    method = URRT(model=model.config, loss_points=64, occupancy_queries=64, occupancy_weight=0.5, agreement_weight=3.0)
+    batch = jax.vmap(lambda key: make_pair(key, jnp.asarray(cloud), PairConfig(points=64), 1.0))(
+        jax.random.split(jax.random.key(0), 2)
+    )
+    one = lambda pair: method.loss({"params": model.params}, pair, jax.random.key(1))[:2]  # noqa: E731
+    loss, told = jax.jit(jax.vmap(one, axis_name=PAIRS))(batch)
+    alignment = (told["chamfer"] + told["chamfer_first"]) / 2  # of two steps
+    np.testing.assert_allclose(
+        loss, alignment + 0.5 * (told["occupancy"] - 3.0 * told.get("agreement", 0.0)), rtol=1e-5
+    )
+    assert ("agreement" in told) == (partition == "parts")
 
 
 def test_sharper_regions_tell_more(parts, clouds):

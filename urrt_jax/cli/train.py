@@ -126,8 +126,8 @@ class Train:
             ours 1e-3.
         warmup: Steps in which the learning rate rises.
         occupancy_weight: Weight of the loss that teaches the regions, against the distance of the clouds.
-        agreement_weight: Weight of the loss that cuts all clouds of a shape alike, against that of occupancy, where
-            regions are parts.
+        agreement_weight: Where regions are parts: weight of the loss that cuts all clouds of a shape alike; it is
+            multiplied by --occupancy-weight.
         loss_points: Points of each cloud that the loss compares, at most --pairs.points.
         unrolled: How many of the network's steps are run in training, at most --model.steps.
         lookups: Points of each cloud that are looked up in training, at most the model's.

@@ -24,6 +24,7 @@ _NEAR = 0.05  # of a width: means nearer than this have no direction
 # reach and spread along it; then growths, cosines, triple products. Rough, and the same for all widths.
 _USUAL = (1.4, 0.7, 0.4, 0.4, 0.45), 1.2, 0.65, 0.0
 _DIFFERING = (0.35, 0.2, 0.15, 0.2, 0.2), 0.25, 0.4, 0.25
+_NOTHING = 1e-6  # less mass than this is none
 _FINEST = 0.1  # of the unit radius: about the distance of neighbours among 512 points of a surface
 
 
@@ -44,15 +45,16 @@ def centred_invariants(invariants: Array, octaves: int) -> Array:
 
 
 def moment_invariants(cloud: Cloud, octaves: int, places: Array | None = None) -> Array:
-    """Invariants (N, ``invariant_count``) of the surroundings of every point under rigid motions of the cloud.
+    """Invariants of the surroundings of every point under rigid motions, (N, ``invariant_count``), or of Q places.
 
     Widths of the Gaussians are 0.1, 0.2, 0.4, … of the frame's unit. All but the triple products, the last columns,
-    are the same for a mirrored cloud; those change sign. They cost N² in time, N·Q for Q places. Zero for padding.
+    are the same for a mirrored cloud; those change sign. They cost N² in time, N·Q for places. Zero for padding. A
+    Gaussian about a place far from all points that holds next to nothing has no mean and no spread.
 
     Args:
       cloud: N points in a frame of unit radius (``normalize_pair``).
       octaves: how many widths.
-      places: (Q, 3), on the cloud or off it: what is described instead of the cloud's own points.
+      places: (Q, 3), on the cloud or off it, described instead of the cloud's own points; none of them is padding.
     """
     points, mask = cloud
     described = points if places is None else places
@@ -82,9 +84,12 @@ def moment_invariants(cloud: Cloud, octaves: int, places: Array | None = None) -
     totals = jnp.moveaxis(jax.lax.map(weighted, blocks), 1, 0).reshape(octaves, -1, moments.shape[1])[:, :count]
     # All octaves at once, (K, N): what follows is compiled once instead of once an octave.
     scale = jnp.array(widths, points.dtype)[:, None]
-    mass = jnp.where(totals[..., 0] > 1e-6, totals[..., 0], 1.0)
-    mean = totals[..., 1:4] / mass[..., None]
+    # Of a point's own surroundings the mass is at least 1, its own.
+    some = totals[..., 0] > _NOTHING
+    mass = jnp.where(some, totals[..., 0], _NOTHING)
+    mean = jnp.where(some[..., None], totals[..., 1:4] / mass[..., None], described)
     spread = (totals[..., 4:] / mass[..., None] - mean[..., upper[0]] * mean[..., upper[1]]) / scale[..., None] ** 2
+    spread = jnp.where(some[..., None], spread, 0.0)
     xx, xy, xz, yy, yz, zz = jnp.moveaxis(spread, -1, 0)
     area = xx * yy + xx * zz + yy * zz - xy**2 - xz**2 - yz**2
     volume = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)

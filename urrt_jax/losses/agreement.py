@@ -1,7 +1,6 @@
-"""Agreement: whether corresponding points of two clouds lie in the same region, and regions are of equal size.
+"""Agreement of regions: high if the region of a point predicts that of its counterpart, and many regions are used.
 
-That is the mutual information of the two regions. It is large only if either one tells the other, and if there are many
-to tell; a partition into one region agrees with itself, but has nothing to tell.
+That is the mutual information of both regions. If all points lie in one region it is zero, although regions agree.
 """
 
 import jax

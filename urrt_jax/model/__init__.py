@@ -4,7 +4,8 @@ One step of the network leads from two normalised clouds to a transform. Each pa
 
 1. **Describe** (``urrt_jax.features.moments``): numbers that describe what surrounds a point, the same from any pose.
 2. **Encode** (``encoder``): an embedding of every point and, by max-pooling, one of the shape.
-3. **Partition** (``partition``): n branches assign every point to a region. They are trained by occupancy alone.
+3. **Partition** (``partition``): n branches assign every point to a region. They are trained by occupancy alone,
+   or, where regions are parts, by occupancy and agreement.
 4. **Attend** (``attention``): the pooled features of the regions, with their centroids encoded, attend to each other.
 5. **Decode** (``decoder``, ``landmarks``): each region has a decoder, which reads the region's features in both clouds
    and asks for eight landmarks in each cloud. A landmark is a weighted mean of all points; the weights compare where
@@ -27,6 +28,10 @@ numbers above are the defaults of ``ModelConfig``.
 - **Region and occupancy.** The paper takes the softmax of the branches as the region's score and its maximum as the
   occupancy. That maximum cannot fall below 1/n, so it cannot say "outside". Here the softmax gives the region, and the
   largest branch logit the occupancy, as in BAE-NET.
+- **Regions that follow the pose.** Branches of [x, e] see where a point lies, so that a shape that is turned is cut in
+  other places. With ``partition="parts"`` they see the invariants of what surrounds a point instead. A loss that the
+  paper does not have (``losses.agreement``) keeps regions in use and alike in noisy samples. The packaged weights have
+  the paper's branches.
 - **How branches start.** The paper does not say. From random weights one branch soon won everywhere, and one region
   was left. Here each branch starts as a blob about an anchor of its own.
 - **Inside and outside of a cloud without a surface.** Here *inside* is a shell: the places whose nearest point is

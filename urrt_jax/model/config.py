@@ -28,7 +28,8 @@ class ModelConfig:
       landmarks: landmarks of a region.
       key_width: dimension in which landmarks and points are compared by place, and again by surroundings.
       sharpness: factor of the logits of landmarks; fresh networks with more of it choose fewer points.
-      octaves: widths at which the points' surroundings are described (``features/moments.py``); 0: not at all.
+      octaves: widths at which the points' surroundings are described (``features/moments.py``); 0: not at all. Parts
+        and landmarks are told apart by them.
       lookups: points of each cloud that are looked up in both, for landmarks too.
       consensus: rounds in which landmarks that disagree with the others are weighed down.
       hypotheses: of the pose, the best of which the first of these rounds starts from; 0: from none.

@@ -1,7 +1,8 @@
 """Point encoder: an embedding for every point and, by max-pooling, one for the shape.
 
-The paper does not name its encoder. This is PointNet's (Qi et al. 2017), which reads a point's coordinates and the
-invariants of its surroundings. It has layer normalisation: batch normalisation has a state and mixes pairs.
+The paper does not name its encoder. This is PointNet's (Qi et al. 2017). It reads a point's coordinates and, where
+decoders give landmarks, the invariants of its surroundings. It has layer normalisation: batch normalisation has a state
+and mixes pairs.
 """
 
 import flax.linen as nn
@@ -22,7 +23,7 @@ class PointEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, points: Array) -> Array:
-        """Point embeddings (N, d) of (N, 3 + q): points, each with its coordinates and its q invariants."""
+        """Point embeddings (N, d) of what is read of each point, (N, ``point_inputs``)."""
         return Perceptron((*self.config.encoder_widths, self.config.width), normalize=True)(points)
 
 
@@ -32,9 +33,9 @@ def shape_embedding(features: Array, mask: Array) -> Array:
 
 
 def point_inputs(config: ModelConfig) -> int:
-    """How many numbers the encoder reads of a point: coordinates, and for landmarks the surroundings' invariants.
+    """How many numbers the encoder reads of a point: its coordinates and, where decoders give landmarks, invariants.
 
-    Poses are regressed from coordinates alone: with invariants that is learned many times more slowly.
+    Decoders that regress the pose see coordinates alone. With invariants they learned much more slowly in a trial.
     """
     return 3 + (invariant_count(config.octaves) if config.decoder == "landmarks" else 0)
 

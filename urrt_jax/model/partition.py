@@ -30,14 +30,12 @@ class Regions(NamedTuple):
     Attributes:
       labels: (N,) int32, the region of every point; padding has label 0 and counts nowhere.
       counts: (n,) float, real points in each region, N_k.
-      scores: (N, n), s_k of every point; (N, 1) ones where the whole cloud is one region.
       features: (n, d), the region feature sequence l, and after attention the sequence a; zero for an empty region.
       centroids: (n, 3), the mean of each region's points, in the network's frame; zero for an empty region.
     """
 
     labels: Array
     counts: Array
-    scores: Array
     features: Array
     centroids: Array
 
@@ -144,11 +142,11 @@ def inputs_of_cloud(config: ModelConfig, cloud: Cloud, embedding: Array, invaria
       invariants: (N, q), of its points' surroundings, which part branches are given.
     """
     if config.partition == "places":
-        return BranchInputs(cloud.points, jax.lax.stop_gradient(embedding))
+        return BranchInputs(cloud.points, embedding)
     real, points = cloud.mask[:, None], centred_invariants(invariants, config.octaves)
     mean = jnp.sum(jnp.where(real, points, 0.0), axis=0) / jnp.maximum(jnp.sum(cloud.mask), 1)
-    largest = jnp.where(jnp.any(cloud.mask), masked_max(points, cloud.mask), 0.0)
-    return BranchInputs(points, jax.lax.stop_gradient(jnp.concatenate([mean, largest])))
+    most = jnp.where(jnp.any(cloud.mask), masked_max(points, cloud.mask), 0.0)
+    return BranchInputs(points, jnp.concatenate([mean, most]))
 
 
 def inputs_at_places(config: ModelConfig, cloud: Cloud, places: Array, condition: Array) -> BranchInputs:
@@ -186,8 +184,7 @@ def whole_region(cloud: Cloud, embedding: Array) -> Regions:
     """The whole cloud of N points as one region, whose feature is the shape embedding (d,)."""
     labels = jnp.zeros(cloud.mask.shape, jnp.int32)
     real = jnp.sum(cloud.mask).astype(cloud.points.dtype)
-    ones = jnp.ones((cloud.mask.shape[0], 1), cloud.points.dtype)
-    return Regions(labels, real[None], ones, embedding[None], centroid(cloud)[None])
+    return Regions(labels, real[None], embedding[None], centroid(cloud)[None])
 
 
 @jax.custom_jvp
@@ -233,7 +230,6 @@ def split_regions(cloud: Cloud, features: Array, logits: Array) -> Regions:
     return Regions(
         labels=labels,
         counts=counts,
-        scores=region_scores(logits),
         features=jnp.where(counts[:, None] > 0, pooled, 0.0),
         centroids=sums / jnp.maximum(counts, 1.0)[:, None],
     )

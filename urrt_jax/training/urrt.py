@@ -30,9 +30,11 @@ class URRT(Trainable):
     Attributes:
       model: the network.
       occupancy_weight: weight of the occupancy loss against the Chamfer loss.
-      agreement_weight: weight of the agreement of regions against the occupancy loss, where regions are parts.
+      agreement_weight: weight of the agreement of regions against the occupancy loss, where regions are parts; it is
+        multiplied by ``occupancy_weight``.
       occupancy_queries: points at which occupancy is asked, per pair.
-      chamfer_scale: scale of the Chamfer penalty, in units of the normalised pair.
+      chamfer_scale: scale of the Chamfer penalty, and of the distance within which points correspond whose regions are
+        to agree, in units of the normalised pair.
       loss_points: points of each whole cloud that the Chamfer loss compares.
       unrolled: steps of the network that training runs, at most the model's; later ones see what the last of them saw.
       lookups: points of each cloud that training looks up, at most the model's.
@@ -67,7 +69,7 @@ class URRT(Trainable):
         return {"params": init_model(key, self.model).params}
 
     def loss(self, variables: Variables, pair: Pair, key: Array) -> tuple[Array, Metrics, Variables]:
-        """The paper's objective (section 2.4) of one pair, with the network as training runs it."""
+        """The paper's objective (section 2.4) of one pair, less the agreement of regions where they are parts."""
         model = Model(self.training_network(), variables["params"])
         source, target, frame = normalize_pair(pair.source, pair.target)
         answer = estimate_subsampled(model, source, target)
@@ -149,9 +151,8 @@ def occupancy_of_target(
 def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Array:
     """How far the regions of corresponding points tell each other, (), in nats: the mean of this cloud and its batch.
 
-    Points of two samples of the cloud correspond that are neighbours. The samples share no point and have noise of
-    their own; they are in one pose, so that none needs to be known. The batch is that of the ``vmap`` whose axis is
-    ``PAIRS``.
+    Points of two random halves of the cloud correspond that are neighbours. Each half has noise of its own. Both are in
+    one pose, so that none needs to be known. The batch is that of the ``vmap`` whose axis is ``PAIRS``.
 
     Args:
       method: what is trained.

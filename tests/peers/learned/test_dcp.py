@@ -7,10 +7,10 @@ import pytest
 
 from urrt_jax import rigid
 from urrt_jax.clouds import Cloud
+from urrt_jax.maxima import masked_max
 from urrt_jax.peers.learned import dcp
 from urrt_jax.peers.learned.dcp import DCP
 from urrt_jax.peers.learned.graph import neighbor_rows
-from urrt_jax.peers.learned.layers import masked_max
 from urrt_jax.peers.learned.matching import soft_targets
 from urrt_jax.peers.learned.network import estimate_batch
 
