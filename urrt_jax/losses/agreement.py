@@ -32,7 +32,7 @@ def mutual_information(pairs: Array) -> Array:
 
     Example:
       >>> import jax.numpy as jnp
-      >>> round(float(mutual_information(jnp.eye(4)) / jnp.log(4)), 4)
+      >>> round(float(mutual_information(jnp.eye(4)) / jnp.log(4)), 2)
       1.0
     """
     joint = (pairs + pairs.T) / 2
