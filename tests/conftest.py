@@ -1,5 +1,6 @@
 """What several tests share: an asymmetric cloud, a pose, a small network that does not answer the identity."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -134,6 +135,12 @@ def make_model():
 def small_model(small_config: ModelConfig) -> Model:
     """A network with random parameters whose estimates are not the identity."""
     return _perturbed(small_config)
+
+
+@pytest.fixture(scope="session")
+def parts_model(small_config: ModelConfig) -> Model:
+    """The same, with regions that are parts of the shape."""
+    return _perturbed(dataclasses.replace(small_config, partition="parts"))
 
 
 @pytest.fixture

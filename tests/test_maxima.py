@@ -8,18 +8,6 @@ import pytest
 from urrt_jax.maxima import masked_max, maximum
 
 
-@pytest.fixture
-def features(x64):
-    """Of 3 pairs, 6 points, 5 edges and 4 channels, far from zero."""
-    return 5 + 2 * jax.random.normal(jax.random.key(0), (3, 6, 5, 4))
-
-
-@pytest.fixture
-def mask():
-    """Of the edges; a third of them is padding."""
-    return jax.random.uniform(jax.random.key(1), (3, 6, 5)) > 1 / 3
-
-
 @pytest.mark.parametrize("axis", [0, 1])
 def test_masked_max_ignores_padding_and_derives_to_one_row(axis):
     features = jnp.array([[[1.0, 5.0], [3.0, 5.0]], [[9.0, 0.0], [2.0, 5.0]]])
@@ -33,9 +21,12 @@ def test_masked_max_ignores_padding_and_derives_to_one_row(axis):
     assert set(np.unique(gradient)) == {0.0, 1.0}
 
 
-def test_masked_max_has_derivatives_in_both_modes(features, mask):
+def test_masked_max_has_derivatives_in_both_modes(x64):
+    features = jax.random.normal(jax.random.key(0), (6, 5, 4))
+    mask = jax.random.uniform(jax.random.key(1), (6, 5)) > 1 / 3
+
     def total(features):
-        return jnp.sum(jnp.sin(masked_max(features[0], mask[0], 1)))
+        return jnp.sum(jnp.sin(masked_max(features, mask, 1)))
 
     _, forward = jax.jvp(total, (features,), (weights := jnp.cos(features),))
     np.testing.assert_allclose(forward, jnp.sum(jax.grad(total)(features) * weights), rtol=1e-9)

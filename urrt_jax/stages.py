@@ -284,8 +284,11 @@ def assess(
 
 @Program
 def label(_: None, cloud: Prepared, moved: Rigid, encoding: Encoding) -> Array:
-    """The region of every point (N,), in the order in which the cloud was given; 0 for padding. Nothing is shared."""
-    labels = point_regions(rigid.apply(moved, cloud.cloud.points), encoding)
+    """The region of every point (N,), in the order in which the cloud was given; 0 for padding.
+
+    The first argument is shared by the clouds of a batch; here it is nothing.
+    """
+    labels = point_regions(rigid.apply(moved, cloud.cloud.points), encoding, count=cloud.count)
     return jnp.zeros_like(labels).at[cloud.rows].set(jnp.where(cloud.cloud.mask, labels, 0))
 
 

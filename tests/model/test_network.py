@@ -396,11 +396,6 @@ def _scores(model: Model, points) -> np.ndarray:
     return np.asarray(region_scores(branch_logits(model.config, model.params["partition"], inputs)))
 
 
-@pytest.fixture(scope="module")
-def parts_model(small_config, make_model) -> Model:
-    return make_model(dataclasses.replace(small_config, partition="parts"))
-
-
 def test_parts_do_not_depend_on_the_pose(parts_model, cloud, pose, x64):
     first, second = (_scores(parts_model, points) for points in (cloud[:60], cloud[:60] @ pose[0].T + pose[1]))
     np.testing.assert_allclose(second, first, atol=1e-4)

@@ -224,3 +224,15 @@ def test_spacing_is_not_set_by_a_stray_point(distance):
 def test_spacing_has_a_finite_gradient():
     gradient = jax.jit(jax.grad(lambda p: spacing(make_cloud(p))))(jnp.ones((6, 3)))
     assert bool(jnp.all(jnp.isfinite(gradient)))
+
+
+@pytest.mark.parametrize("count", [0, 1, 20_000, 40_000])
+def test_many_queries_of_a_small_cloud_skip_padding(count):
+    """In chunks: those that hold nothing but padding are not compared, and name no neighbour."""
+    rng = np.random.default_rng(0)
+    query, reference = rng.normal(size=(40_000, 3)), rng.normal(size=(50, 3))
+    found = jax.jit(lambda count: nearest(jnp.asarray(query), make_cloud(reference), count=count))(jnp.array(count))
+    expected = cKDTree(reference).query(query[:count])[1]
+    np.testing.assert_array_equal(found.index[:count], expected)
+    compared = -(-count // 16_384) * 16_384  # the size of a chunk
+    assert not np.isfinite(found.squared[compared:]).any()

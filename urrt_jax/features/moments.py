@@ -7,6 +7,7 @@ widths, and the triple products of three.
 """
 
 import itertools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -30,15 +31,18 @@ _FINEST = 0.1  # of the unit radius: about the distance of neighbours among 512 
 
 def invariant_count(octaves: int) -> int:
     """How many invariants ``moment_invariants`` gives of a point."""
-    pairs, triples = octaves * (octaves - 1) // 2, octaves * (octaves - 1) * (octaves - 2) // 6
-    return 5 * octaves + max(octaves - 1, 0) + pairs + triples
+    return 5 * octaves + sum(_between_widths(octaves))
+
+
+def _between_widths(octaves: int) -> tuple[int, int, int]:
+    """How many invariants compare widths: growths of the mass, cosines of two means, triple products."""
+    return max(octaves - 1, 0), math.comb(octaves, 2), math.comb(octaves, 3)
 
 
 def centred_invariants(invariants: Array, octaves: int) -> Array:
     """Invariants (..., ``invariant_count``) less what they usually are, divided by how far they usually differ."""
-    pairs, triples = octaves * (octaves - 1) // 2, octaves * (octaves - 1) * (octaves - 2) // 6
     usual, differing = (
-        np.concatenate([np.tile(each, octaves), np.repeat(others, [max(octaves - 1, 0), pairs, triples])])
+        np.concatenate([np.tile(each, octaves), np.repeat(others, _between_widths(octaves))])
         for each, *others in (_USUAL, _DIFFERING)
     )
     return (invariants - jnp.asarray(usual, invariants.dtype)) / jnp.asarray(differing, invariants.dtype)

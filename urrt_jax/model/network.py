@@ -122,9 +122,14 @@ def predict(model: Model, source: Cloud, target: Cloud) -> Rigid:
     return frame.leave(estimate_subsampled(model, source, target).transform)
 
 
-def point_regions(points: Array, encoding: Encoding) -> Array:
+def point_regions(points: Array, encoding: Encoding, *, count: Array | None = None) -> Array:
     """The region (N,) int32 of any points (N, 3) in the network's frame; 0 for model A.
 
     The network sees at most ``config.points`` points of a cloud. A region is that of the nearest one of them.
+
+    Args:
+      points: on the cloud or off it.
+      encoding: of the cloud whose regions these are.
+      count: (), the points from this row on are padding, whose answers mean nothing; None where all are wanted.
     """
-    return encoding.regions.labels[nearest(points, encoding.cloud).index]
+    return encoding.regions.labels[nearest(points, encoding.cloud, count=count).index]

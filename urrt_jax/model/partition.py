@@ -143,7 +143,12 @@ def inputs_of_cloud(config: ModelConfig, cloud: Cloud, embedding: Array, invaria
     """
     if config.partition == "places":
         return BranchInputs(cloud.points, embedding)
-    real, points = cloud.mask[:, None], centred_invariants(invariants, config.octaves)
+    return inputs_of_parts(config, cloud, invariants)
+
+
+def inputs_of_parts(config: ModelConfig, cloud: Cloud, invariants: Array) -> BranchInputs:
+    """What part branches are given of all N points of a cloud with these invariants (N, q)."""
+    points, real = centred_invariants(invariants, config.octaves), cloud.mask[:, None]
     mean = jnp.sum(jnp.where(real, points, 0.0), axis=0) / jnp.maximum(jnp.sum(cloud.mask), 1)
     most = jnp.where(jnp.any(cloud.mask), masked_max(points, cloud.mask), 0.0)
     return BranchInputs(points, jnp.concatenate([mean, most]))

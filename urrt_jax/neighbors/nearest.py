@@ -70,11 +70,17 @@ def nearest(
         if query.shape[0] <= 2 * _QUERY_CHUNK:
             return _nearest_scan(fixed, anchors, used, distinct, block)
 
-        def one(point: Array) -> tuple[Array, Array]:
-            index, found = _nearest_scan(point[None], anchors, used, distinct, block or 8)
-            return index[0], found[0]
+        size, at_once = query.shape[0], block
+        chunks = jnp.pad(fixed, ((0, -size % _QUERY_CHUNK), (0, 0))).reshape(-1, _QUERY_CHUNK, 3)
 
-        return jax.lax.map(one, fixed, batch_size=_QUERY_CHUNK)
+        def visit(number: Array, answers: tuple[Array, Array]) -> tuple[Array, Array]:
+            found = _nearest_scan(chunks[number], anchors, used, distinct, at_once)
+            return answers[0].at[number].set(found[0]), answers[1].at[number].set(found[1])
+
+        nothing = jnp.zeros(chunks.shape[:2], jnp.int32), jnp.zeros(chunks.shape[:2], bool)
+        needed = (largest(wanted) + _QUERY_CHUNK - 1) // _QUERY_CHUNK
+        index, found = jax.lax.fori_loop(0, needed, visit, nothing)
+        return index.reshape(-1)[:size], found.reshape(-1)[:size]
 
     if blocks is not None:
         # Walking over blocks is a loop of small steps: right for a CPU, while accelerators compare all sooner.

@@ -11,10 +11,11 @@ from urrt_jax.checks import check_positive, check_whole
 from urrt_jax.clouds import Cloud, first, shift
 from urrt_jax.features import moment_invariants
 from urrt_jax.frames import Frame, normalize_pair
+from urrt_jax.loops import each_cloud
 from urrt_jax.losses import chamfer, mutual_information, occupancy_loss, region_pairs, shell_samples
 from urrt_jax.model import Model, ModelConfig, init_model
 from urrt_jax.model.network import Estimate, estimate_subsampled
-from urrt_jax.model.partition import branch_logits, inputs_at_places, inputs_of_cloud, occupancy_logits, region_scores
+from urrt_jax.model.partition import branch_logits, inputs_at_places, inputs_of_parts, occupancy_logits, region_scores
 from urrt_jax.neighbors import nearest
 from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, add_noise
@@ -73,14 +74,14 @@ class URRT(Trainable):
         model = Model(self.training_network(), variables["params"])
         source, target, frame = normalize_pair(pair.source, pair.target)
         answer = estimate_subsampled(model, source, target)
-        distances = alignment_losses(self, pair, frame, answer.steps)
+        whole = whole_clouds(pair, frame)
+        distances = alignment_losses(self, *whole, answer.steps)
         loss, metrics = jnp.mean(distances), {"chamfer": distances[-1], "chamfer_first": distances[0]}
         if self.model.has_regions:
-            occupancy, found = occupancy_of_target(self, model, pair, frame, answer, key)
+            occupancy, found = occupancy_of_target(self, model, pair, frame, whole[1], answer, key)
             loss, metrics = loss + self.occupancy_weight * occupancy, metrics | found
             if self.model.partition == "parts":
-                whole = shift(pair.whole_target, frame.target_center, frame.scale)
-                agreement = region_agreement(self, model, whole, jax.random.fold_in(key, 1))
+                agreement = region_agreement(self, model, whole[1], jax.random.fold_in(key, 1))
                 loss = loss - self.occupancy_weight * self.agreement_weight * agreement
                 metrics |= {"agreement": agreement}
         return loss, metrics, {}
@@ -89,7 +90,7 @@ class URRT(Trainable):
         """The Chamfer distance after the last step of the whole network, which needs no labels, and its transform."""
         source, target, frame = normalize_pair(pair.source, pair.target)
         answer = estimate_subsampled(self.as_model(variables), source, target)
-        return alignment_losses(self, pair, frame, answer.steps)[-1], frame.leave(answer.transform)
+        return alignment_losses(self, *whole_clouds(pair, frame), answer.steps)[-1], frame.leave(answer.transform)
 
     def training_network(self) -> ModelConfig:
         """The network as training runs it: the parameters are the same, but it does less."""
@@ -106,12 +107,17 @@ class URRT(Trainable):
         return Model(self.model, variables["params"])
 
 
-def alignment_losses(method: URRT, pair: Pair, frame: Frame, steps: Rigid) -> Array:
-    """The Chamfer distance (K,) after every step, of the whole source, moved, and the whole target.
+def whole_clouds(pair: Pair, frame: Frame) -> tuple[Cloud, Cloud]:
+    """Source and target before corruption, in the network's frame. Losses compare these, whatever the network sees."""
+    return (
+        shift(pair.whole_source, frame.source_center, frame.scale),
+        shift(pair.whole_target, frame.target_center, frame.scale),
+    )
 
-    The network itself has seen the corrupted clouds. The true pose of the pair is not read.
-    """
-    source, target = whole_clouds(method, pair, frame)
+
+def alignment_losses(method: URRT, source: Cloud, target: Cloud, steps: Rigid) -> Array:
+    """The Chamfer distance (K,) of the whole source, moved by the estimate of every step, and the whole target."""
+    source, target = first(source, method.loss_points), first(target, method.loss_points)
 
     def aligned(transform: Rigid) -> Array:
         moved = source._replace(points=rigid.apply(transform, source.points))
@@ -120,20 +126,15 @@ def alignment_losses(method: URRT, pair: Pair, frame: Frame, steps: Rigid) -> Ar
     return jax.vmap(aligned)(steps)
 
 
-def whole_clouds(method: URRT, pair: Pair, frame: Frame) -> tuple[Cloud, Cloud]:
-    """Source and target before corruption, in the network's frame, thinned to what the losses compare."""
-    return (
-        first(shift(pair.whole_source, frame.source_center, frame.scale), method.loss_points),
-        first(shift(pair.whole_target, frame.target_center, frame.scale), method.loss_points),
-    )
-
-
 def occupancy_of_target(
-    method: URRT, model: Model, pair: Pair, frame: Frame, answer: Estimate, key: Array
+    method: URRT, model: Model, pair: Pair, frame: Frame, whole: Cloud, answer: Estimate, key: Array
 ) -> tuple[Array, Metrics]:
-    """The loss of occupancy, asked of the target, () and what is worth a line in the log."""
+    """The loss of occupancy, asked of the target, (), and what is worth a line in the log.
+
+    Where the pair has no queries, they are drawn about the ``whole`` target.
+    """
     if pair.queries is None or pair.inside is None:
-        queries, inside = shell_samples(key, whole_clouds(method, pair, frame)[1], method.occupancy_queries)
+        queries, inside = shell_samples(key, first(whole, method.loss_points), method.occupancy_queries)
     else:
         rows = jax.random.choice(key, pair.queries.shape[0], (method.occupancy_queries,))
         queries, inside = (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
@@ -168,15 +169,14 @@ def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Ar
         add_noise(noise, jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], cloud), sigma)
         for noise, chosen in zip(noises, (rows[:count], rows[-count:]), strict=True)
     )
-    scores = [_sample_scores(model, each) for each in (one, other)]
+    here, there = each_cloud(lambda sample: _sample_scores(model, sample), one, other)
     found = nearest(one.points, other)
     weights = jnp.where(one.mask, jnp.exp(-found.squared / method.chamfer_scale**2), 0.0)
-    pairs = region_pairs(scores[0], scores[1][found.index], weights)
+    pairs = region_pairs(here, there[found.index], weights)
     return (mutual_information(pairs) + mutual_information(jax.lax.pmean(pairs, PAIRS))) / 2
 
 
 def _sample_scores(model: Model, cloud: Cloud) -> Array:
     """The scores (N, n) of the regions of a cloud whose branches see surroundings."""
-    invariants = moment_invariants(cloud, model.config.octaves)
-    inputs = inputs_of_cloud(model.config, cloud, jnp.zeros(model.config.width), invariants)
+    inputs = inputs_of_parts(model.config, cloud, moment_invariants(cloud, model.config.octaves))
     return region_scores(branch_logits(model.config, model.params["partition"], inputs))
