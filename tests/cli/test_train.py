@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import numpy as np
 import pytest
 
 import urrt_jax
@@ -84,8 +85,8 @@ def _write_log(directory) -> None:
 
 
 def test_train_writes_the_model_with_its_card(capsys, tmp_path, monkeypatch):
-    def fake_train(config, shapes, validation, directory, *, loop):
-        assert (config.steps, config.pairs.points, loop.every) == (20, 64, 10)
+    def fake_train(config, shapes, validation, directory, *, start, loop):
+        assert (config.steps, config.pairs.points, loop.every, start) == (20, 64, 10, None)
         _write_log(directory)
         return jax.jit(config.method.init)(jax.random.key(0))
 
@@ -105,10 +106,36 @@ def test_train_writes_the_model_with_its_card(capsys, tmp_path, monkeypatch):
     assert str(tmp_path) not in json.dumps(card)
 
 
+def test_train_begins_with_the_weights_it_is_given(capsys, tmp_path, monkeypatch):
+    packaged, given = urrt_jax.load_model(), {}
+
+    def fake_train(config, shapes, validation, directory, *, start, loop):
+        given.update(start)
+        _write_log(directory)
+        return {"params": packaged.params}
+
+    monkeypatch.setattr("urrt_jax.training.loop.train", fake_train)
+    file = urrt_jax.save_model(packaged, tmp_path / "mine.npz")
+    flags = f"--start {file} --limit 6 --validation-share 0.3 --model.partition parts"
+    assert cli.main(["train", "--out", str(tmp_path / "run"), *flags.split()]) == 0
+    jax.tree.map(np.testing.assert_array_equal, given, packaged.params)
+    assert f"51 of the 56 arrays of {file} have their place in this network" in capsys.readouterr().err
+    card = urrt_jax.model_card(tmp_path / "run" / "model.npz")
+    assert card["start"] == {"model": "mine", "sha256": urrt_jax.model_card(file)["sha256"]}
+    assert "--start mine.npz" in card["command"]
+    assert str(tmp_path) not in json.dumps(card)
+
+
+def test_train_refuses_a_start_that_is_no_model(capsys, tmp_path):
+    assert cli.main(["train", "--out", str(tmp_path / "run"), "--start", "modelnet41"]) == 2
+    assert "no packaged model is called 'modelnet41'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_train_can_leave_categories_unseen(tmp_path, monkeypatch):
     seen = []
 
-    def fake_train(config, shapes, validation, directory, *, loop):
+    def fake_train(config, shapes, validation, directory, *, start, loop):
         seen.extend([*shapes.labels, *validation.labels])
         raise KeyboardInterrupt
 
@@ -165,7 +192,7 @@ def test_other_method_is_trained_at_its_published_learning_rate_unless_told(peer
 @pytest.mark.parametrize(
     "flags",
     ["--model.width 64", "--occupancy-weight 0.1", "--loss-points 64", "--unrolled 1", "--lookups 8", "--rounds 2",
-     "--queries 100"],
+     "--queries 100", "--start modelnet40"],
 )  # fmt: skip
 def test_flag_of_our_network_with_another_method_is_wrong_use(peers, capsys, tmp_path, flags):
     assert cli.main(["train", "--out", str(tmp_path / "run"), "--method", "dcp_v2", *flags.split()]) == 2
@@ -177,7 +204,7 @@ def test_flag_of_our_network_with_another_method_is_wrong_use(peers, capsys, tmp
 def test_other_method_is_saved_with_a_card_that_says_nothing_of_regions(peers, capsys, tmp_path, monkeypatch):
     variables = {"params": {}, "batch_stats": {}}
 
-    def fake_train(config, shapes, validation, directory, *, loop):
+    def fake_train(config, shapes, validation, directory, *, start, loop):
         assert (config.method, loop.minutes) == (Peer(), 1.5)
         _write_log(directory)
         return variables

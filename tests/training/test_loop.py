@@ -16,7 +16,7 @@ from urrt_jax.training import loop as loop_module
 from urrt_jax.training.checkpoints import Checkpoints
 from urrt_jax.training.loop import Log, LoopConfig, train
 from urrt_jax.training.pairs import PairConfig
-from urrt_jax.training.state import TrainConfig, init_state
+from urrt_jax.training.state import TrainConfig, begin_with, init_state
 from urrt_jax.training.step import train_steps
 from urrt_jax.training.urrt import URRT
 from urrt_jax.training.validation import validate, validation_pairs
@@ -152,6 +152,38 @@ def test_finished_run_started_again_changes_nothing(shapes, unbroken):
 def test_another_configuration_in_the_folder_is_refused(shapes, unbroken):
     with pytest.raises(ValueError, match="batch: 4 there, 5 now"):
         train(dataclasses.replace(_CONFIG, batch=5), shapes, shapes, unbroken[0], loop=_LOOP)
+
+
+def _params(seed, **changes):
+    return _init(dataclasses.replace(_with(**changes), seed=seed)).params
+
+
+def test_run_begins_with_the_parameters_it_is_given(shapes, tmp_path):
+    config = dataclasses.replace(_CONFIG, steps=5, learning_rate=1e-12, weight_decay=0.0)
+    found = train(config, shapes, shapes, tmp_path, start=_params(3), loop=_LOOP)["params"]
+    jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, atol=1e-9), found, _params(3))
+
+
+def test_run_with_another_start_is_refused(shapes, tmp_path):
+    config = dataclasses.replace(_CONFIG, steps=5)
+    train(config, shapes, shapes, tmp_path, start=_params(3), loop=_LOOP)
+    with pytest.raises(ValueError, match=r"data\.start"):
+        train(config, shapes, shapes, tmp_path, start=_params(4), loop=_LOOP)
+    with pytest.raises(ValueError, match=r"data\.start"):
+        train(config, shapes, shapes, tmp_path, loop=_LOOP)
+
+
+def test_parameters_of_other_names_or_shapes_stay_as_they_are():
+    parts = dataclasses.replace(_METHOD.model, partition="parts")
+    state, given = _init(_CONFIG), _params(3, model=parts)
+    begun = begin_with(state, given).params
+    jax.tree.map(np.testing.assert_array_equal, begun["partition"], state.params["partition"])
+    jax.tree.map(np.testing.assert_array_equal, begun["encoder"], given["encoder"])
+
+
+def test_parameters_of_which_none_fits_are_refused():
+    with pytest.raises(ValueError, match="start: none"):
+        begin_with(_init(_CONFIG), {"encoder": {"kernel": jnp.zeros((3, 3))}})
 
 
 @pytest.fixture(scope="module")

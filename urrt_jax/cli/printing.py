@@ -97,7 +97,7 @@ def changed_flags(flags: Any, prefix: str = "") -> list[str]:
             typed.append(f"--{name}")
         elif value != field.default:
             values = value if isinstance(value, tuple) else (value,)
-            paths = name in ("out", "data", "model")
+            paths = name in ("out", "data", "model", "start")
             typed += [f"--{name}", *(Path(each).name if paths else without_folder(str(each)) for each in values)]
     return typed
 

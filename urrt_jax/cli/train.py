@@ -89,7 +89,17 @@ class PairFlags:
     outliers: float = 0.2
 
 
-_OURS = ("model", "queries", "occupancy_weight", "agreement_weight", "loss_points", "unrolled", "lookups", "rounds")
+_OURS = (
+    "model",
+    "start",
+    "queries",
+    "occupancy_weight",
+    "agreement_weight",
+    "loss_points",
+    "unrolled",
+    "lookups",
+    "rounds",
+)
 """The flags that belong to our own network."""
 
 
@@ -106,6 +116,8 @@ class Train:
 
     On ModelNet40: urrt train --out runs/modelnet40 --data ModelNet40/
 
+    From trained weights: urrt train --out runs/mine --data shapes/ --start modelnet40 --steps 1000
+
     Another method: urrt train --out runs/dcp --data ModelNet40/ --method dcp_v2
 
     Exit codes: 0, the model was written. 2, wrong use or bad input. 130, stopped by Ctrl-C.
@@ -113,6 +125,8 @@ class Train:
     Attributes:
         out: Folder of the run.
         method: What is trained: 'urrt', our network, or another learned method.
+        start: Name of a packaged model, or a file written by 'urrt train', whose weights a new run begins with. Weights
+            that have no counterpart of the same shape there are random.
         data: 'procedural', a .npz file, a folder of ModelNet40, or a folder of meshes or clouds; by default $URRT_DATA,
             else 'procedural'. Each file is a whole shape; a cloud needs at least --pairs.points points.
         limit: Use at most this many shapes.
@@ -149,6 +163,7 @@ class Train:
     method: Literal[
         "urrt", "dcp_v1", "dcp_v2", "prnet", "rpmnet", "deepgmr", "pointnetlk", "pointnetlk_revisited", "rienet"
     ] = "urrt"
+    start: str | None = None
     data: str | None = None
     limit: int | None = None
     categories: int | None = None
@@ -218,14 +233,16 @@ class Train:
 
         import jax
 
-        from urrt_jax import __version__
+        from urrt_jax import __version__, load_model, model_card
         from urrt_jax.cli.interrupt import leave_ctrl_c_to_python
         from urrt_jax.cli.printing import print_skipped
         from urrt_jax.cli.streams import note
         from urrt_jax.data import find_data, load_shapes
         from urrt_jax.training.loop import LoopConfig, train
+        from urrt_jax.training.state import counterparts
 
         config, source = self.config(), find_data(self.data)
+        start = None if self.start is None else load_model(self.start).params
         loop = LoopConfig(
             every=self.every,
             log_every=self.log_every,
@@ -244,9 +261,14 @@ class Train:
             surface = "a shell around each cloud" if loaded.queries is None else "inside and outside of closed meshes"
             note(f"the regions learn from {surface}")
             own = {"occupancy": surface}
+        if self.start is not None and start is not None:
+            own |= {"start": {"model": Path(self.start).stem, "sha256": model_card(self.start)["sha256"]}}
+            taken = counterparts(config.method.init(jax.random.key(0))["params"], start)
+            given = len(jax.tree.leaves(start))
+            note(f"{len(taken)} of the {given} arrays of {self.start} have their place in this network")
         leave_ctrl_c_to_python()  # the loop saves first
         try:
-            variables = train(config, shapes, validation, self.out, loop=loop)
+            variables = train(config, shapes, validation, self.out, start=start, loop=loop)
         except KeyboardInterrupt:
             note(f"stopped; the same command continues the run in {self.out}")
             return 130

@@ -22,10 +22,11 @@ from urrt_jax.atomic import write_atomically
 from urrt_jax.checks import check_positive, check_whole
 from urrt_jax.data import Shapes
 from urrt_jax.training.checkpoints import Checkpoints, ranking_loss
-from urrt_jax.training.state import TrainConfig, TrainState, init_state
+from urrt_jax.training.state import TrainConfig, TrainState, begin_with, init_state
 from urrt_jax.training.step import train_steps
 from urrt_jax.training.trainable import Variables
 from urrt_jax.training.validation import validate, validation_pairs
+from urrt_jax.weights.files import digest
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,7 @@ def train(
     validation: Shapes,
     directory: str | Path,
     *,
+    start: dict | None = None,
     loop: LoopConfig = LoopConfig(),
 ) -> Variables:
     """The best variables of a run, by validation loss; the run continues where ``directory`` left off.
@@ -78,11 +80,14 @@ def train(
       shapes: to train on.
       validation: held out of the same split; checkpoints are chosen by these.
       directory: of the run.
+      start: parameters of a trained network that a new run begins with, where they have the names and shapes of its own
+        (``begin_with``); the others are random. None: all are.
       loop: how it is watched.
 
     Raises:
-      ValueError: the folder holds a run of another method, configuration or data, another process is training there,
-        its configuration or all of its checkpoints are damaged, or the intervals do not fit ``steps_per_call``.
+      ValueError: the folder holds a run of another method, configuration, data or start, another process is training
+        there, its configuration or all of its checkpoints are damaged, the intervals do not fit ``steps_per_call``, or
+        nothing of ``start`` fits.
       FloatingPointError: a whole interval of steps had non-finite gradients.
       KeyboardInterrupt: on Ctrl-C, after the state was saved.
     """
@@ -91,9 +96,12 @@ def train(
             raise ValueError(f"{name}: {getattr(loop, name)} is no multiple of steps_per_call, {config.steps_per_call}")
     mesh = jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
     everywhere = NamedSharding(mesh, PartitionSpec())
-    data = {"shapes": _fingerprint(shapes), "validation": _fingerprint(validation)}
+    data: dict[str, Any] = {"shapes": _fingerprint(shapes), "validation": _fingerprint(validation)}
+    if start is not None:
+        data["start"] = digest(start)
     with Checkpoints(directory, config, data, keep=loop.keep) as checkpoints, jax.set_mesh(mesh):
-        state = jax.device_put(init_state(config), everywhere)
+        state = init_state(config)
+        state = jax.device_put(state if start is None else begin_with(state, start), everywhere)
         state = checkpoints.restore_latest(state) or state
         arrays = jax.device_put(_arrays(shapes), everywhere)
         held_out = validation_pairs(config, _arrays(validation), loop.validation_pairs)

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jax import Array
 
 from urrt_jax.checks import check_positive, check_whole
@@ -103,3 +104,25 @@ def init_state(config: TrainConfig) -> TrainState:
     return TrainState(
         jnp.zeros((), jnp.int32), params, variables.get("batch_stats", {}), optimizer(config).init(params)
     )
+
+
+def begin_with(state: TrainState, params: dict) -> TrainState:
+    """The state before the first step, with these parameters in the place of its own (``counterparts``).
+
+    Raises:
+      ValueError: none of them has the name and shape of one of the state's.
+    """
+    taken = counterparts(state.params, params)
+    if not taken:
+        raise ValueError("start: none of its parameters has the name and shape of one of this network's")
+    own = flatten_dict(state.params)
+    return dataclasses.replace(state, params=unflatten_dict(own | {key: jnp.asarray(taken[key]) for key in taken}))
+
+
+def counterparts(own: dict, given: dict) -> dict[tuple[str, ...], Any]:
+    """Those of the given parameters, by their path, whose names and shapes are those of a network's own.
+
+    A network that differs in a part, for example in how it cuts clouds, finds the rest of a trained one here.
+    """
+    expected, found = flatten_dict(own), flatten_dict(given)
+    return {path: found[path] for path in expected if path in found and found[path].shape == expected[path].shape}
