@@ -75,6 +75,18 @@ def test_padding_does_not_change_the_samples(prepared, expected, sample):
     np.testing.assert_array_equal(found.points, alone.points)
 
 
+def test_padding_does_not_change_the_constellations(prepared, expected):
+    found, alone = prepared.samples.constellations, expected.samples.constellations
+    np.testing.assert_array_equal(found.cloud.points, alone.cloud.points)
+    np.testing.assert_array_equal(found.distances, alone.distances)
+    assert np.all(found.cloud.mask)
+
+
+@pytest.mark.parametrize(("count", "known"), [(THINNED, True), (THINNED + 1, False)])
+def test_only_small_clouds_have_constellations(count, known):
+    assert np.any(_prepare(_SIZES, make_cloud(_points(count))).samples.constellations.cloud.mask) == known
+
+
 def test_padding_does_not_change_the_queries(prepared, expected):
     np.testing.assert_array_equal(_real(prepared.queries), _real(expected.queries))
 

@@ -93,8 +93,9 @@ def clean(cloud) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def hard(cloud) -> tuple[np.ndarray, np.ndarray]:
-    """A cloud and the same points turned so far that the network and refinement do not align them."""
-    return cloud, _moved(cloud, 150)
+    """A cloud turned so far that network and refinement do not align it, with noise that hides that it is the same."""
+    noise = np.random.default_rng(8).normal(scale=0.004, size=cloud.shape).astype(np.float32)
+    return cloud, _moved(cloud, 150) + noise
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +134,15 @@ def test_without_search_a_pair_turned_far_runs_none(called, call, hard):
     assert not _RARE & set(called) - {"expect"}
 
 
-def test_a_search_that_is_asked_for_runs_for_a_clean_pair_too(called, call, clean):
-    call(*clean, search=Search())
-    assert set(called) == _USUAL | {"search_thoroughly"}
+def test_clouds_of_the_same_points_are_found_without_a_search(called, call, cloud):
+    found = call(cloud, _moved(cloud, 150), search=Search())
+    assert _degrees(found.rotation, _turn(150)) < 0.01
+    assert set(called) == _USUAL
+
+
+def test_a_search_that_is_asked_for_runs_for_an_easy_pair_too(called, call, sparse):
+    call(*sparse, search=Search())
+    assert set(called) == _USUAL | {"search_thoroughly", "expect"}
 
 
 def test_without_refinement_the_network_is_all_that_runs(called, call, hard):

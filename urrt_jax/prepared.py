@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud, centroid, curve_order, first, normals, subsample, take, thin
-from urrt_jax.neighbors import LARGE, LEAST_SPACING, Blocks, make_blocks, spacing
+from urrt_jax.features import Constellations, constellations
+from urrt_jax.neighbors import LARGE, LEAST_SPACING, Blocks, make_blocks, nearest, spacing
 
 THINNED = 4096
 """Points of a thinned cloud: normals are made from them, and the first steps of a large pair's refinement."""
@@ -38,11 +39,13 @@ class Samples(NamedTuple):
       even: an even subsample, farthest points first (``subsample``).
       spacing: (), the even subsample's resolution (``neighbors.spacing``), never 0.
       thinned: at most ``THINNED`` points whose density follows the cloud's, along the curve (``thin``).
+      constellations: points that are known again where the other cloud holds them, too; none of a cloud of more.
     """
 
     even: Cloud
     spacing: Array
     thinned: Cloud
+    constellations: Constellations
 
 
 class Prepared(NamedTuple):
@@ -80,13 +83,21 @@ def prepare(sizes: Sizes, cloud: Cloud) -> Prepared:
     thinned, queries = (thin(cloud, size, ordered=True) for size in (THINNED, sizes.queries))
     radius = sizes.normal_radius * thinned_spacing(count, width)
     even = subsample(thinned, sizes.sample)
+    known = thinned._replace(mask=thinned.mask & (count <= THINNED))
+    apart = nearest(known.points, known, distinct=True).squared
+    samples = Samples(
+        even=even,
+        spacing=jnp.maximum(spacing(even), LEAST_SPACING),
+        thinned=first(thinned, THINNED),
+        constellations=constellations(known, apart, width),
+    )
     return Prepared(
         cloud=cloud,
         rows=rows,
         count=count,
         blocks=blocks,
         spacing=width,
-        samples=Samples(even, jnp.maximum(spacing(even), LEAST_SPACING), first(thinned, THINNED)),
+        samples=samples,
         queries=queries,
         normals=normals(queries.points, thinned, radius, centroid(cloud)),
     )

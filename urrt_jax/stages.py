@@ -4,13 +4,14 @@ A registration takes these steps. Each one after the first is a *stage*: a progr
 
 1. **Normalise** (``frames``, before the stages). Both clouds are centred, and divided by one common scale, their root
    mean square radius. The result is carried back into the clouds' own units at the end.
-2. **Prepare** (``prepare``). Each cloud is sorted along a space-filling curve; its spacing and normals are measured.
+2. **Prepare** (``prepare``). Each cloud is sorted along a space-filling curve; its spacing and normals are measured,
+   and of small clouds the constellations, by which points of both clouds are known again.
    Farthest-point sampling chooses 512 points, the same ones however the cloud is turned, moved, scaled or ordered.
    Clouds of more than 4,096 points are first thinned along the curve, and that does depend on how they are turned.
 3. **Estimate** (``estimate``). The network (``urrt_jax.model``) estimates the transform from these samples. The user's
    initial transform takes its place where it fits better.
-4. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. It calls for a search
-   where the samples do not fit in it.
+4. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. Where small clouds hold
+   the same points, constellations of these give it. It calls for a search where the samples do not fit in it.
 5. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``; rare). Matched FPFH features and the
    network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Nothing is random.
 6. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
@@ -205,13 +206,20 @@ def estimate(model: Model, source: Samples, target: Samples, told: Told) -> Star
 def approach(
     options: tuple[ICP, Array | bool], source: Samples, target: Samples, counts: tuple[Array, Array], start: Rigid
 ) -> Plan:
-    """The plain pose, refined on even samples, and what it calls for."""
+    """The plain pose, refined on even samples, and what it calls for.
+
+    Where both clouds hold the same points, these tell the pose, and there is nothing to search for: on a plane, whose
+    samples slide, other poses may well fit better.
+    """
     how, always = options
     transform, width = find_basin(how, source, target, start)
+    same = search.find_counterparts(source.constellations, target.constellations)
+    transform = jax.tree.map(lambda own, other: jnp.where(same.sure, other, own), transform, same.transform)
+    width = jnp.where(same.sure, 0.0, width)
     glance = fit_samples(source.even, target.even, transform, prepared.coarser(source, target))
     fewer = jnp.minimum(*counts)
     dense = fewer >= search.DENSE
-    pending = jnp.asarray(always) | (glance.score < jnp.where(dense, _FITS_DENSE, _FITS))
+    pending = ~same.sure & (always | (glance.score < jnp.where(dense, _FITS_DENSE, _FITS)))
     return Plan(Found(transform, jnp.zeros_like(width), width, pending), pending & dense, fewer > THINNED)
 
 

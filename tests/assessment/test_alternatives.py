@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from urrt_jax import rigid
 from urrt_jax.assessment import alternatives
 from urrt_jax.assessment.alternatives import KEPT, Alternatives, find_alternatives
-from urrt_jax.clouds import make_cloud, subsample
+from urrt_jax.clouds import first, make_cloud, subsample
 from urrt_jax.data import symmetric_shapes, symmetry
+from urrt_jax.features import constellations
 from urrt_jax.neighbors import LEAST_SPACING, spacing
 from urrt_jax.prepared import Samples, coarser
 from urrt_jax.rigid import Rigid
@@ -22,7 +23,8 @@ _ROWS = 512  # of every sample, as in ``register``
 def _samples(points: jax.Array, mask: jax.Array) -> Samples:
     cloud = make_cloud(points, mask)
     even = subsample(cloud, _ROWS)
-    return Samples(even, jnp.maximum(spacing(even), LEAST_SPACING), cloud)
+    none = constellations(first(cloud, 1), jnp.full(1, jnp.inf), spacing(even))
+    return Samples(even, jnp.maximum(spacing(even), LEAST_SPACING), cloud, none)
 
 
 def _sampled(points: np.ndarray, rows: int = _ROWS) -> Samples:

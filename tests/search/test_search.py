@@ -294,10 +294,18 @@ def test_a_quick_look_at_another_shape_is_not_sure(look, cloud):
 @pytest.mark.parametrize(
     ("counts", "quick"), [((DENSE, DENSE), True), ((DENSE - 1, 10**6), False), ((10**6, DENSE - 1), False)]
 )
-def test_only_dense_clouds_are_looked_at_quickly(partial, counts, quick):
-    samples = _samples(*(_pad(cloud) for cloud in partial(120)))
+def test_only_dense_clouds_are_looked_at_quickly(cloud, make_cloud_points, counts, quick):
+    samples = _samples(_pad(cloud), _pad(make_cloud_points(1)))
     plan = stages.approach((ICP(), True), *samples, tuple(map(np.int32, counts)), rigid.identity())
     assert bool(plan.quick) == quick
+    assert plan.found.pending
+
+
+def test_clouds_of_the_same_points_are_not_searched(partial):
+    samples = _samples(*(_pad(cloud) for cloud in partial(120)))
+    plan = stages.approach((ICP(), True), *samples, (np.int32(DENSE),) * 2, rigid.identity())
+    assert not plan.found.pending and not plan.quick
+    assert _degrees(plan.found.transform.rotation, _turn(120)) < 0.01
 
 
 @pytest.mark.parametrize("preference", [-0.1, 1.5, float("nan"), "much"])
@@ -334,8 +342,9 @@ def test_lengths_that_are_not_positive_are_refused_by_name(name, length):
 
 @pytest.fixture(scope="module")
 def half_turned(cloud) -> np.ndarray:
-    """The cloud turned by 150 degrees and moved."""
-    return (cloud @ _turn(150).T + _SHIFT).astype(np.float32)
+    """The cloud turned by 150 degrees and moved, with noise that hides that its points are the same."""
+    noise = np.random.default_rng(8).normal(scale=0.004, size=cloud.shape)
+    return (cloud @ _turn(150).T + _SHIFT + noise).astype(np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,18 @@
-"""Global search: hypotheses from matched features and from the network's landmarks, the best of which are refined."""
+"""Global search: hypotheses from matched features and from the network's landmarks, the best of which are refined.
+
+Where both clouds hold the same points, ``find_counterparts`` finds the pose without a search.
+"""
 
 from urrt_jax.search.config import Search
+from urrt_jax.search.counterparts import Counterparts, find_counterparts
 from urrt_jax.search.search import DENSE, Found, search_quickly, search_thoroughly
 
-__all__ = ["DENSE", "Found", "Search", "search_quickly", "search_thoroughly"]
+__all__ = [
+    "DENSE",
+    "Counterparts",
+    "Found",
+    "Search",
+    "find_counterparts",
+    "search_quickly",
+    "search_thoroughly",
+]
