@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from flax.traverse_util import flatten_dict, unflatten_dict
 from jax import Array
 
 from urrt_jax.checks import check_positive, check_whole
 from urrt_jax.training.pairs import PairConfig
 from urrt_jax.training.trainable import Trainable, Variables
 from urrt_jax.training.urrt import URRT
+from urrt_jax.weights.files import flatten, unflatten
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,14 +115,13 @@ def begin_with(state: TrainState, params: dict) -> TrainState:
     taken = counterparts(state.params, params)
     if not taken:
         raise ValueError("start: none of its parameters has the name and shape of one of this network's")
-    own = flatten_dict(state.params)
-    return dataclasses.replace(state, params=unflatten_dict(own | {key: jnp.asarray(taken[key]) for key in taken}))
+    return dataclasses.replace(state, params=unflatten(flatten(state.params) | taken))
 
 
-def counterparts(own: dict, given: dict) -> dict[tuple[str, ...], Any]:
-    """Those of the given parameters, by their path, whose names and shapes are those of a network's own.
+def counterparts(own: dict, given: dict) -> dict[str, Any]:
+    """Those of the given parameters, by flat keys, whose names and shapes are those of a network's own.
 
     A network that differs in a part, for example in how it cuts clouds, finds the rest of a trained one here.
     """
-    expected, found = flatten_dict(own), flatten_dict(given)
-    return {path: found[path] for path in expected if path in found and found[path].shape == expected[path].shape}
+    expected, found = flatten(own), flatten(given)
+    return {key: found[key] for key in expected if key in found and found[key].shape == expected[key].shape}
