@@ -1,0 +1,76 @@
+"""The ablation at equal time: its ratios and intervals, and that rows are kept while they compare."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+RUN = Path(__file__).parents[2] / "experiments" / "ablation" / "equal_time.py"
+
+
+@pytest.fixture
+def ablation(tmp_path, monkeypatch):
+    """The script as a module that writes elsewhere."""
+    spec = importlib.util.spec_from_file_location("equal_time", RUN)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "HERE", tmp_path)
+    monkeypatch.setattr(module, "RESAMPLED", 400)
+    return module
+
+
+def _row(ablation, name, seed=0, scale=1.0, pairs=60):
+    random = np.random.default_rng(seed)
+    angles = {each: (scale * random.exponential(size=pairs)).tolist() for each in ablation.PROTOCOLS}
+    return {"model": name, "seed": seed, "steps": 100, "seconds": 360, "angles": angles}
+
+
+def test_models_differ_and_each_has_its_base(ablation):
+    configs = [ablation.configured(name, 100, 0) for name in ablation.MODELS]
+    assert len(set(map(repr, configs))) == len(ablation.MODELS) == 8
+    for name, base in ablation.BASES.items():
+        assert ablation.MODELS[base].variant == "A"
+        assert ablation.MODELS[base].decoder == ablation.MODELS[name].decoder
+    landmarks = [
+        each.landmarks * (each.regions if each.has_regions else 1)
+        for each in ablation.MODELS.values()
+        if each.decoder == "landmarks"
+    ]
+    assert set(landmarks) == {64}
+
+
+def test_ratio_of_a_model_to_itself_is_one(ablation):
+    rows = [_row(ablation, "A, pose", seed) for seed in range(3)]
+    mean, low, high = ablation.ratio(rows, rows, ablation.PARTIAL)
+    assert mean == 1
+    assert low < 1 < high
+
+
+def test_interval_holds_the_true_ratio_and_narrows_with_pairs(ablation):
+    widths = []
+    for pairs in (20, 2_000):
+        base = [_row(ablation, "A, pose", seed, 1.0, pairs) for seed in range(3)]
+        rows = [_row(ablation, "C, parts, pose", seed + 3, 0.7, pairs) for seed in range(3)]
+        mean, low, high = ablation.ratio(rows, base, ablation.PARTIAL)
+        assert low < 0.7 < high and low < mean < high
+        widths.append(high - low)
+    assert widths[1] < widths[0] / 3
+
+
+def test_rows_are_kept_beside_each_other_while_data_and_time_are_the_same(ablation, tmp_path):
+    for name, seed in (("C, parts, pose", 1), ("A, pose", 0), ("C, parts, pose", 0), ("A, pose", 0)):
+        ablation.keep(_row(ablation, name, seed), "data", 6.0)
+    rows = json.loads((tmp_path / "equal_time.json").read_text())["rows"]
+    assert [(row["model"], row["seed"]) for row in rows] == [
+        ("A, pose", 0), ("C, parts, pose", 0), ("C, parts, pose", 1)
+    ]  # fmt: skip
+    assert "C, parts, pose, 2 seeds" in (tmp_path / "equal_time.md").read_text()
+    ablation.keep(_row(ablation, "A, pose"), "data", 7.0)
+    assert len(json.loads((tmp_path / "equal_time.json").read_text())["rows"]) == 1
+
+
+def test_table_of_a_model_whose_base_is_missing_has_no_ratio(ablation):
+    (line,) = ablation.as_markdown([_row(ablation, "B, parts, pose")]).splitlines()[2:]
+    assert "| – |" in line
