@@ -60,7 +60,7 @@ _VARIANTS: dict[str, dict[str, Any]] = {
     "C, places": {"variant": "C"},
     "C, parts": {"variant": "C"} | _PARTS,
 }
-_WIDER = {("A", "landmarks"): {"landmarks": 64}}  # as many as eight regions have
+_WIDER: dict[tuple[str, str], dict[str, Any]] = {("A", "landmarks"): {"landmarks": 64}}  # as many as eight regions have
 MODELS = {
     f"{variant}, {decoder}": ModelConfig(**_DECODERS[decoder] | changes | _WIDER.get((variant, decoder), {}))
     for decoder in _DECODERS
@@ -103,7 +103,7 @@ def measured(name: str, seed: int, steps: int, shapes: Shapes, test: np.ndarray)
     folder = HERE / "runs" / f"{name.replace(', ', '_')}_{seed}_{steps}"
     variables = train(config, held_in, held_out, folder, loop=LoopConfig(every=max(10, steps // 2)))
     log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    ours = Ours(model=URRT(model=config.method.model).as_model(variables), refine=None)
+    ours = Ours(model=URRT(model=MODELS[name]).as_model(variables), refine=None)
     found = {each: evaluate(ours, each, test, progress=False).errors()["angle"] for each in PROTOCOLS}
     seconds = max(entry.get("seconds", 0.0) for entry in log)
     angles = {each: np.round(values, 4).tolist() for each, values in found.items()}

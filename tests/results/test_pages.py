@@ -148,15 +148,14 @@ RESULTS = (
     f"{_noise('outliers', 'plain', 'angle_mean'):.2f}° for D.O.",
     f"RANSAC with ICP has {_noise('drift', 'ransac_icp', 'angle_mean'):.2f}° and "
     f"{_noise('outliers', 'ransac_icp', 'angle_mean'):.2f}°",
-    f"({_noise('incomplete_both', 'ransac_icp', RECALL):.3f}, `register` "
-    f"{_noise('incomplete_both', 'plain', RECALL):.3f})",
-    f"MAE(t) is {_noise('incomplete_both', 'ransac_icp', 'mae_translation'):.4f}, that of `register` "
-    f"{_noise('incomplete_both', 'plain', 'mae_translation'):.4f}",
-    f"MAE(R) is {_noise('incomplete_both', 'ransac_icp', 'mae_rotation'):.2f}°, that of `register` "
-    f"{_noise('incomplete_both', 'plain', 'mae_rotation'):.2f}°, or "
-    f"{_noise('incomplete_both', 'plain', 'asymmetric.mae_rotation'):.2f}° without",
-    f"RANSAC finds {_noise('incomplete_both', 'ransac', RECALL):.3f} of the pairs, `register` "
-    f"{_noise('incomplete_both', 'plain', RECALL):.3f}",
+    f"`register` finds {_noise('incomplete_both', 'plain', RECALL):.3f} of the pairs**, RANSAC with ICP "
+    f"{_noise('incomplete_both', 'ransac_icp', RECALL):.3f}.",
+    f"MAE(R) is {_noise('incomplete_both', 'plain', 'mae_rotation'):.3f}°, that of RANSAC with ICP "
+    f"{_noise('incomplete_both', 'ransac_icp', 'mae_rotation'):.2f}°",
+    f"MAE(t) is {_noise('incomplete_both', 'plain', 'mae_translation'):.4f} against "
+    f"{_noise('incomplete_both', 'ransac_icp', 'mae_translation'):.4f}",
+    f"`register` finds {_noise('incomplete_both', 'plain', RECALL):.3f} of the pairs, RANSAC "
+    f"{_noise('incomplete_both', 'ransac', RECALL):.3f}.",
     f"within 5° on {_beyond('independent_noise', 'plain', RECALL):.3f} of the pairs, ICP on "
     f"{_beyond('independent_noise', 'icp', RECALL):.3f}",
     f"within 5° on {_beyond('independent_noise', 'plain', 'asymmetric.' + RECALL):.3f}. ",
