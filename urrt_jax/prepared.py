@@ -39,7 +39,8 @@ class Samples(NamedTuple):
       even: an even subsample, farthest points first (``subsample``).
       spacing: (), the even subsample's resolution (``neighbors.spacing``), never 0.
       thinned: at most ``THINNED`` points whose density follows the cloud's, along the curve (``thin``).
-      constellations: points that are known again where the other cloud holds them, too; none of a cloud of more.
+      constellations: points that are known again where the other cloud holds them, too; none where ``thinned`` is not
+        the whole cloud.
     """
 
     even: Cloud

@@ -11,10 +11,11 @@ points, which is where regions should help: a region may be seen in both clouds 
   the pose, and points are known by their coordinates alone.
 
 Every model trains for the same time on one processor, by which its steps are chosen: how fast it is, is measured first.
-Checkpoints are chosen on shapes held out of the training split. Errors are over test shapes, one step, without
-refinement; a model's ratio to A is that of the mean errors, with an interval that holds 95 % of resampled sets of pairs
-and seeds. Runs are kept in runs/ beside this file: an interrupted command continues where it stopped, and commands with
-other names may run beside each other. Writes equal_time.json and equal_time.md, with the models that are there.
+Checkpoints are chosen on shapes held out of the training split. Errors are over every fourth test shape (RPM-Net's
+crops: all of its subset), one step, without refinement. A model's ratio to A is that of the mean errors, with an
+interval that holds 95 % of resampled sets of pairs and seeds. Runs are kept in runs/ beside this file: an interrupted
+command continues where it stopped, and commands with other names may run beside each other. Writes equal_time.json and
+equal_time.md, with the models that are there.
 """
 
 import argparse
@@ -46,10 +47,11 @@ PROTOCOLS = {
     "incomplete_both": "D.I. two-sided",
     "drift": "P.D.",
     "outliers": "D.O. 10 %",
-    "prnet_noise": "PRNet crops + noise",
+    "rpmnet": "RPM-Net crops",
     "independent_noise": "independent + noise",
 }
-PARTIAL = ("incomplete_both", "outliers", "prnet_noise")
+PARTIAL = ("incomplete_both", "rpmnet")
+RPMNET = "modelnet40_2048_normals_subset.npz"
 _LANDMARKS: dict[str, Any] = {"lookups": 0, "consensus": 3, "hypotheses": 0, "steps": 1}
 _POSE: dict[str, Any] = _LANDMARKS | {"decoder": "pose", "octaves": 0, "consensus": 0, "points": 256}
 _DECODERS = {"landmarks": _LANDMARKS, "pose": _POSE}
@@ -78,11 +80,15 @@ def configured(name: str, steps: int, seed: int) -> TrainConfig:
     return TrainConfig(method=method, pairs=pairs, batch=BATCH, steps=steps, warmup=steps // 10, seed=seed)
 
 
+def folder(name: str) -> Path:
+    """Where the runs of a model are kept."""
+    return HERE / "runs" / name.replace(", ", "_")
+
+
 def steps_in(minutes: float, name: str, shapes: Shapes) -> int:
     """The steps that a model trains in so many minutes here; measured once, and kept beside its runs."""
-    path = HERE / "runs" / "rates.json"
-    rates = json.loads(path.read_text()) if path.exists() else {}
-    if name not in rates:
+    path = folder(name) / "steps_per_second.json"
+    if not path.exists():
         config, arrays = configured(name, 100, 0), {"points": jnp.asarray(shapes.points[:256])}
         state, _ = train_steps(init_state(config), arrays, config)  # compiles
         jax.block_until_ready(state)
@@ -90,21 +96,20 @@ def steps_in(minutes: float, name: str, shapes: Shapes) -> int:
         for _ in range(8):
             state, _ = train_steps(state, arrays, config)
         jax.block_until_ready(state)
-        rates[name] = 8 / (time.perf_counter() - start)
-        path.parent.mkdir(exist_ok=True)
-        write_atomically(path, json.dumps(rates))
-    return max(20, round(60 * minutes * rates[name]))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(8 / (time.perf_counter() - start)))
+    return max(20, round(60 * minutes * json.loads(path.read_text())))
 
 
-def measured(name: str, seed: int, steps: int, shapes: Shapes, test: np.ndarray) -> dict[str, Any]:
-    """The row of one model and seed: the angle in degrees of every pair of every protocol."""
+def measured(name: str, seed: int, steps: int, shapes: Shapes, test: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The row of one model and seed: the angle in degrees of every pair of every protocol, of whose shapes ``test``."""
     config = configured(name, steps, seed)
     held_in, held_out = shapes.split_validation(0.05, 0)
-    folder = HERE / "runs" / f"{name.replace(', ', '_')}_{seed}_{steps}"
-    variables = train(config, held_in, held_out, folder, loop=LoopConfig(every=max(10, steps // 2)))
-    log = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    run = folder(name) / f"{seed}_{steps}"
+    variables = train(config, held_in, held_out, run, loop=LoopConfig(every=max(10, steps // 2)))
+    log = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     ours = Ours(model=URRT(model=MODELS[name]).as_model(variables), refine=None)
-    found = {each: evaluate(ours, each, test, progress=False).errors()["angle"] for each in PROTOCOLS}
+    found = {each: evaluate(ours, each, test[each], progress=False).errors()["angle"] for each in PROTOCOLS}
     seconds = max(entry.get("seconds", 0.0) for entry in log)
     angles = {each: np.round(values, 4).tolist() for each, values in found.items()}
     return {"model": name, "seed": seed, "steps": steps, "seconds": round(seconds), "angles": angles}
@@ -116,18 +121,20 @@ def ratio(rows: list[dict], bases: list[dict], protocols: tuple[str, ...]) -> tu
     Protocols count alike; pairs are resampled together for both models, seeds for each by itself.
     """
     random = np.random.default_rng(0)
-    errors, base = (np.array([[row["angles"][each] for each in protocols] for row in some]) for some in (rows, bases))
+    errors = [[np.array([row["angles"][each] for row in some]) for each in protocols] for some in (rows, bases)]
 
-    def mean_ratio(ours: np.ndarray, theirs: np.ndarray) -> float:
-        return float(np.mean(ours.mean(axis=(0, 2)) / theirs.mean(axis=(0, 2))))
+    def drawn() -> float:
+        """The ratio in a resampled set."""
+        seeds = [random.integers(0, len(some), len(some)) for some in (rows, bases)]
+        shares = []
+        for ours, theirs in zip(*errors, strict=True):
+            pairs = random.integers(0, ours.shape[1], ours.shape[1])
+            shares.append(ours[seeds[0]][:, pairs].mean() / theirs[seeds[1]][:, pairs].mean())
+        return float(np.mean(shares))
 
-    drawn = []
-    for _ in range(RESAMPLED):
-        pairs = random.integers(0, errors.shape[2], errors.shape[2])
-        seeds, other_seeds = (random.integers(0, len(each), len(each)) for each in (errors, base))
-        drawn.append(mean_ratio(errors[seeds][:, :, pairs], base[other_seeds][:, :, pairs]))
-    low, high = np.quantile(drawn, (0.025, 0.975))
-    return mean_ratio(errors, base), float(low), float(high)
+    low, high = np.quantile([drawn() for _ in range(RESAMPLED)], (0.025, 0.975))
+    found = np.mean([ours.mean() / theirs.mean() for ours, theirs in zip(*errors, strict=True)])
+    return float(found), float(low), float(high)
 
 
 def as_markdown(rows: list[dict[str, Any]]) -> str:
@@ -171,13 +178,14 @@ def keep(row: dict[str, Any], data: str, minutes: float) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
+    parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it, with RPM-Net's shapes")
     parser.add_argument("--only", nargs="+", choices=MODELS, default=list(MODELS), help="these models")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of weights and pairs")
     parser.add_argument("--minutes", type=float, default=6.0, help="of training each")
     flags = parser.parse_args()
     shapes = load_shapes(flags.data, points=1024)
-    test = load_shapes(flags.data, split="test", points=1024).points[::STRIDE]
+    test = dict.fromkeys(PROTOCOLS, load_shapes(flags.data, split="test", points=1024).points[::STRIDE])
+    test["rpmnet"] = load_shapes(str(Path(flags.data) / RPMNET), split="test", points=2048).points
     todo = [(name, seed) for seed in flags.seeds for name in flags.only]
     for name, seed in tqdm(todo, unit="run"):
         steps = steps_in(flags.minutes, name, shapes)

@@ -1,22 +1,15 @@
 """The ablation at equal time: its ratios and intervals, and that rows are kept while they compare."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-RUN = Path(__file__).parents[2] / "experiments" / "ablation" / "equal_time.py"
-
 
 @pytest.fixture
-def ablation(tmp_path, monkeypatch):
+def ablation(load_script, monkeypatch):
     """The script as a module that writes elsewhere."""
-    spec = importlib.util.spec_from_file_location("equal_time", RUN)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(module, "HERE", tmp_path)
+    module = load_script("ablation/equal_time.py")
     monkeypatch.setattr(module, "RESAMPLED", 400)
     return module
 

@@ -1,21 +1,14 @@
 """The benchmark of first use: which pairs it takes, how runs become one number, and what its files keep."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "experiments" / "benchmarks" / "first_use.py"
 
-
-@pytest.fixture(scope="module")
-def first_use():
+@pytest.fixture
+def first_use(load_script):
     """The script as a module."""
-    spec = importlib.util.spec_from_file_location("first_use", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("benchmarks/first_use.py")
 
 
 def result(title, seconds, **changes):

@@ -1,22 +1,14 @@
 """The table of trials: rows are kept in the order of the trials while base, data and changes stay the same."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import pytest
 
-RUN = Path(__file__).parents[2] / "experiments" / "trials" / "run.py"
-
 
 @pytest.fixture
-def trials(tmp_path, monkeypatch):
+def trials(load_script):
     """The script as a module that writes elsewhere."""
-    spec = importlib.util.spec_from_file_location("trials", RUN)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(module, "HERE", tmp_path)
-    return module
+    return load_script("trials/run.py")
 
 
 def row(trials, name, **changes):

@@ -183,8 +183,15 @@ def well_posed(cloud: Cloud) -> Array:
     points = jax.lax.stop_gradient(cloud.points)
     # Rounding alone gives points on a line a second moment of about 1e-7 of the first.
     moments = jnp.matmul(points.T, points, precision=_HIGHEST)
-    # On a line all but one eigenvalue vanish, and with them the sum of their products, the second invariant. (LAPACK's
-    # batched eigenvalues of two clouds may wait for each other for ever on a CPU.)
-    trace = jnp.trace(moments)
-    products = (trace**2 - jnp.sum(moments**2)) / 2
+    trace, products = trace_and_products(moments)
     return (jnp.sum(cloud.mask) >= 3) & (products > 1e-6 * trace**2)
+
+
+def trace_and_products(moments: Array) -> tuple[Array, Array]:
+    """The sum of the eigenvalues of second moments (3, 3), and the sum of the products of two, the second invariant.
+
+    On a line all but one eigenvalue vanish, and with them the products. (LAPACK's batched eigenvalues of two clouds may
+    wait for each other for ever on a CPU.)
+    """
+    trace = jnp.trace(moments)
+    return trace, (trace**2 - jnp.sum(moments**2)) / 2

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax import rigid
+from urrt_jax.assessment.fit import trace_and_products
 from urrt_jax.features import Constellations
 from urrt_jax.rigid import Rigid
 from urrt_jax.search.matches import Matches, poses_from_matches
@@ -62,5 +63,5 @@ def _off_one_line(points: Array, chosen: Array, unit: Array) -> Array:
     weights = chosen / jnp.maximum(jnp.sum(chosen), 1)
     offsets = points - weights @ points
     moments = jnp.einsum("n,ni,nj->ij", weights, offsets, offsets, precision="highest")
-    trace = jnp.trace(moments)
-    return (trace**2 - jnp.sum(moments**2)) / 2 > trace * unit**2
+    trace, products = trace_and_products(moments)
+    return products > trace * unit**2
