@@ -11,7 +11,7 @@ from urrt_jax.model import Model
 from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, PairConfig, make_pair
 from urrt_jax.training.trainable import PAIRS
-from urrt_jax.training.urrt import URRT, region_agreement
+from urrt_jax.training.urrt import URRT, agreement_of_samples
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def model(request, small_model, parts_model) -> Model:
 def _agreement(model: Model, clouds: np.ndarray) -> jax.Array:
     """Of a batch of whole clouds (B, N, 3)."""
     method = URRT(model=model.config)
-    one = lambda points, key: region_agreement(method, model, make_cloud(points), key)  # noqa: E731
+    one = lambda points, key: agreement_of_samples(method, model, make_cloud(points), key)  # noqa: E731
     return jax.jit(jax.vmap(one, axis_name=PAIRS))(clouds, jax.random.split(jax.random.key(0), len(clouds)))
 
 
@@ -61,12 +61,11 @@ def test_loss_is_the_sum_of_its_parts(model, batch):
     assert ("agreement" in told) == (model.config.partition == "parts")
 
 
-def test_sharper_regions_tell_more(parts_model, clouds):
-    partition = parts_model.params["partition"] | {
-        "Dense_3": jax.tree.map(lambda leaf: 5 * leaf, parts_model.params["partition"]["Dense_3"])
-    }
-    sharper = Model(parts_model.config, parts_model.params | {"partition": partition})
-    assert float(jnp.mean(_agreement(sharper, clouds))) > float(jnp.mean(_agreement(parts_model, clouds)))
+def test_one_region_for_all_points_has_no_agreement(parts_model, clouds):
+    last = parts_model.params["partition"]["Dense_3"]
+    partition = parts_model.params["partition"] | {"Dense_3": last | {"bias": last["bias"].at[0].add(100.0)}}
+    collapsed = Model(parts_model.config, parts_model.params | {"partition": partition})
+    assert float(jnp.max(_agreement(collapsed, clouds))) < 0.01 < float(jnp.min(_agreement(parts_model, clouds)))
 
 
 def test_agreement_does_not_depend_on_the_pose(parts_model, clouds, pose, monkeypatch):

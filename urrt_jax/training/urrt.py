@@ -12,7 +12,7 @@ from urrt_jax.clouds import Cloud, first, shift
 from urrt_jax.features import moment_invariants
 from urrt_jax.frames import Frame, normalize_pair
 from urrt_jax.loops import each_cloud
-from urrt_jax.losses import chamfer, mutual_information, occupancy_loss, region_pairs, shell_samples
+from urrt_jax.losses import chamfer, occupancy_loss, region_agreement, region_pairs, shell_samples
 from urrt_jax.model import Model, ModelConfig, init_model
 from urrt_jax.model.network import Estimate, estimate_subsampled
 from urrt_jax.model.partition import branch_logits, inputs_at_places, inputs_of_parts, occupancy_logits, region_scores
@@ -21,6 +21,7 @@ from urrt_jax.rigid import Rigid
 from urrt_jax.training.pairs import Pair, add_noise
 from urrt_jax.training.trainable import PAIRS, Metrics, Trainable, Variables
 
+_SHARPNESS = 5.0  # of the scores that are to agree: fresh branches hardly differ, and would stay alike twice as long
 _NOISE = 0.03  # largest deviation of the noise of samples whose regions are to agree, in the network's frame
 
 
@@ -81,7 +82,7 @@ class URRT(Trainable):
             occupancy, found = occupancy_of_target(self, model, pair, frame, whole[1], answer, key)
             loss, metrics = loss + self.occupancy_weight * occupancy, metrics | found
             if self.model.partition == "parts":
-                agreement = region_agreement(self, model, whole[1], jax.random.fold_in(key, 1))
+                agreement = agreement_of_samples(self, model, whole[1], jax.random.fold_in(key, 1))
                 loss = loss - self.occupancy_weight * self.agreement_weight * agreement
                 metrics |= {"agreement": agreement}
         return loss, metrics, {}
@@ -149,8 +150,8 @@ def occupancy_of_target(
     }
 
 
-def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Array:
-    """How far the regions of corresponding points tell each other, (), in nats: the mean of this cloud and its batch.
+def agreement_of_samples(method: URRT, model: Model, cloud: Cloud, key: Array) -> Array:
+    """How well the regions of two noisy samples agree (``region_agreement``), (): the mean of this cloud and its batch.
 
     Points of two random halves of the cloud correspond that are neighbours. Each half has noise of its own. Both are in
     one pose, so that none needs to be known. The batch is that of the ``vmap`` whose axis is ``PAIRS``.
@@ -173,10 +174,10 @@ def region_agreement(method: URRT, model: Model, cloud: Cloud, key: Array) -> Ar
     found = nearest(one.points, other)
     weights = jnp.where(one.mask, jnp.exp(-found.squared / method.chamfer_scale**2), 0.0)
     pairs = region_pairs(here, there[found.index], weights)
-    return (mutual_information(pairs) + mutual_information(jax.lax.pmean(pairs, PAIRS))) / 2
+    return (region_agreement(pairs) + region_agreement(jax.lax.pmean(pairs, PAIRS))) / 2
 
 
 def _sample_scores(model: Model, cloud: Cloud) -> Array:
-    """The scores (N, n) of the regions of a cloud whose branches see surroundings."""
+    """The sharpened scores (N, n) of the regions of a cloud whose branches see surroundings."""
     inputs = inputs_of_parts(model.config, cloud, moment_invariants(cloud, model.config.octaves))
-    return region_scores(branch_logits(model.config, model.params["partition"], inputs))
+    return region_scores(_SHARPNESS * branch_logits(model.config, model.params["partition"], inputs))
