@@ -19,7 +19,7 @@ from urrt_jax.registration import make_options
 from urrt_jax.stages import register_in_frame, rung
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
-_USUAL = {"prepare", "estimate", "approach", "settle", "compare", "assess", "label"}
+_USUAL = {"prepare", "recognise", "estimate", "approach", "settle", "compare", "assess", "label"}
 _RARE = {"search_quickly", "search_thoroughly", "settle_thinned", "expect"}
 _AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
 _SHIFT = np.array([0.4, -0.2, 0.7])

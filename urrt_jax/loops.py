@@ -95,6 +95,17 @@ def _largest_of_batch(size: int, batched: list[bool], count: Array) -> tuple[Arr
     return largest(jnp.max(count)), False
 
 
+@custom_vmap
+def anyone(flag: Array) -> Array:
+    """The flag, (); under ``vmap`` whether it is set anywhere in the batch, so that ``cond`` still takes one branch."""
+    return flag
+
+
+@anyone.def_vmap
+def _anyone_of_batch(size: int, batched: list[bool], flag: Array) -> tuple[Array, bool]:
+    return anyone(jnp.any(flag)), False
+
+
 def _queue(unfinished: Callable, step: Callable, start: Any, context: Any, batched: Any, places: int) -> Any:
     size = jax.tree.leaves(start)[0].shape[0]
     axes = jax.tree.map(lambda has: 0 if has else None, batched)

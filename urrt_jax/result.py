@@ -128,7 +128,7 @@ class Registration:
         without regions (model A).
       target_regions: (M,) int32, the same for the target.
       coarse: the network's own estimate: after at most two steps where refinement follows, and after as many as its
-        configuration says where none does.
+        configuration says where none does. Where both clouds hold the same points, the pose that these tell.
       steps: (), the iterations of refinement's last stage; 0 without refinement.
     """
 

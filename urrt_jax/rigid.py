@@ -22,9 +22,21 @@ class Rigid(NamedTuple):
     translation: Array
 
 
+class Known(NamedTuple):
+    """A transform, and whether it is known, (), bool; where it is not, it means nothing."""
+
+    transform: Rigid
+    sure: Array
+
+
 def identity() -> Rigid:
     """The transform that moves nothing."""
     return Rigid(jnp.eye(3), jnp.zeros(3))
+
+
+def choose(flag: Array, transform: Rigid, otherwise: Rigid) -> Rigid:
+    """The transform where the flag () is set, else the other one."""
+    return jax.tree.map(lambda one, other: jnp.where(flag, one, other), transform, otherwise)
 
 
 def rotate(rotation: Array, points: Array) -> Array:

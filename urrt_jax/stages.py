@@ -8,20 +8,22 @@ A registration takes these steps. Each one after the first is a *stage*: a progr
    and of small clouds the constellations, by which points of both clouds are known again.
    Farthest-point sampling chooses 512 points, the same ones however the cloud is turned, moved, scaled or ordered.
    Clouds of more than 4,096 points are first thinned along the curve, and that does depend on how they are turned.
-3. **Estimate** (``estimate``). The network (``urrt_jax.model``) estimates the transform from these samples. The user's
+3. **Recognise** (``recognise``). Where small clouds hold the same points, constellations of these tell the pose. It is
+   *known* then, and what would look for it is passed over.
+4. **Estimate** (``estimate``). The network (``urrt_jax.model``) estimates the transform from the samples. The user's
    initial transform takes its place where it fits better.
-4. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. Where small clouds hold
-   the same points, constellations of these give it. It calls for a search where the samples do not fit in it.
-5. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``; rare). Matched FPFH features and the
+5. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. It calls for a search
+   where the samples do not fit in it.
+6. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``; rare). Matched FPFH features and the
    network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Nothing is random.
-6. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
+7. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
    directions, among the full clouds, mostly point to plane. The bandwidth of its weights shrinks to the spacing, and
    then to the spread of the distances themselves, so that points without a counterpart do not pull. Small clouds whose
    points have no counterparts at all are refined by EM-ICP (``expect``; rare).
-7. **Compare** (``compare``). Other poses that fit about as well: the source is turned about the centre of both clouds,
+8. **Compare** (``compare``). Other poses that fit about as well: the source is turned about the centre of both clouds,
    and the turns that fit best are refined and compared with the pose.
-8. **Assess** (``assess``). Inliers, overlap, the information matrix, the covariance, and the confidence.
-9. **Label** (``label``). The region of every point.
+9. **Assess** (``assess``). Inliers, overlap, the information matrix, the covariance, and the confidence.
+10. **Label** (``label``). The region of every point.
 
 ``register_in_frame`` calls the stages. On arrays it reads from each result whether a rare stage is needed, and runs
 (and compiles) it only then. Under a trace the same stages are composed, and rare ones become loops that only run for
@@ -32,6 +34,7 @@ whatever the clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole
 of the ladder, as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
 """
 
+import dataclasses
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -56,15 +59,15 @@ from urrt_jax.assessment import (
     well_posed,
 )
 from urrt_jax.clouds import Cloud, first, mean_square_radius
-from urrt_jax.loops import where_needed
-from urrt_jax.model.encoding import Encoding
-from urrt_jax.model.network import Model, point_regions
+from urrt_jax.features import Constellations
+from urrt_jax.loops import anyone, each_cloud, where_needed
+from urrt_jax.model.network import Model, encode, point_regions
 from urrt_jax.model.network import estimate as apply_network
 from urrt_jax.prepared import THINNED, Prepared, Samples, Sizes
 from urrt_jax.programs import Program
 from urrt_jax.refine import ICP, find_basin
 from urrt_jax.result import OtherPoses, Outcome
-from urrt_jax.rigid import Rigid
+from urrt_jax.rigid import Known, Rigid
 from urrt_jax.search import Found, Search
 
 STEPS_BEFORE_REFINEMENT = 2
@@ -90,24 +93,34 @@ def rung(count: int) -> int:
     return size
 
 
+class Seen(NamedTuple):
+    """A cloud as the network saw it last.
+
+    Attributes:
+      moved: the transform that the cloud had undergone.
+      cloud: the points that it saw, at most ``ModelConfig.points``.
+      labels: (N,) int32, their regions.
+    """
+
+    moved: Rigid
+    cloud: Cloud
+    labels: Array
+
+
 class Start(NamedTuple):
     """Where registration begins.
 
     Attributes:
       transform: the network's estimate, or the user's initial transform where that fits better.
-      coarse: the network's estimate.
-      seen: the transform that the source had undergone when the network's last step saw it.
-      still: that of the target: the identity.
-      source: the network's encoding of the source.
-      target: that of the target.
+      coarse: the network's estimate, or the pose that was known.
+      source: what the network saw of the source.
+      target: what it saw of the target.
     """
 
     transform: Rigid
     coarse: Rigid
-    seen: Rigid
-    still: Rigid
-    source: Encoding
-    target: Encoding
+    source: Seen
+    target: Seen
 
 
 class Plan(NamedTuple):
@@ -186,40 +199,67 @@ class Outputs(NamedTuple):
 
 
 @Program
-def estimate(model: Model, source: Samples, target: Samples, told: Told) -> Start:
+def recognise(_: None, source: Constellations, target: Constellations) -> Known:
+    """The pose of clouds that hold the same points. The first argument is shared by a batch; here it is nothing."""
+    return search.find_counterparts(source, target)
+
+
+@Program
+def estimate(model: Model, source: Samples, target: Samples, known: Known, told: Told) -> Start:
     """Where registration begins, from even samples of both clouds."""
-    answer = apply_network(model, *(first(each.even, model.config.points) for each in (source, target)))
     nothing = rigid.identity()
+    clouds = first(source.even, model.config.points), first(target.even, model.config.points)
+
+    def look_for_pose() -> tuple[Rigid, Seen, Seen]:
+        answer = apply_network(model, *clouds, known)
+        moved = Seen(answer.seen, answer.source.cloud, answer.source.regions.labels)
+        return answer.transform, moved, Seen(nothing, answer.target.cloud, answer.target.regions.labels)
+
+    def take_known_pose() -> tuple[Rigid, Seen, Seen]:
+        idle = dataclasses.replace(model, config=dataclasses.replace(model.config, lookups=0))
+
+        def look(pose: Rigid, cloud: Cloud) -> Seen:
+            moved = jnp.where(cloud.mask[:, None], rigid.apply(pose, cloud.points), 0.0)
+            found = encode(idle, cloud._replace(points=moved))
+            return Seen(pose, found.cloud, found.regions.labels)
+
+        seen = each_cloud(lambda each: look(*each), (known.transform, clouds[0]), (nothing, clouds[1]))
+        return known.transform, *seen
+
+    coarse, *seen = jax.lax.cond(anyone(~known.sure), look_for_pose, take_known_pose)
     given = Rigid(nothing.rotation, told.offset)
-    poses = jax.tree.map(lambda *leaves: jax.lax.stop_gradient(jnp.stack(leaves)), answer.transform, given)
+    poses = jax.tree.map(lambda *leaves: jax.lax.stop_gradient(jnp.stack(leaves)), coarse, given)
     even = source.even, target.even
     scores = jax.lax.cond(
         jnp.asarray(told.has_initial),
         lambda: agreement(poses, even, even, prepared.coarser(source, target)),
         lambda: jnp.zeros(2, poses.translation.dtype),
     )
-    begin = jax.tree.map(lambda own, other: jnp.where(scores[0] < scores[1], other, own), answer.transform, given)
-    return Start(begin, answer.transform, answer.seen, nothing, answer.source, answer.target)
+    return Start(rigid.choose(~known.sure & (scores[0] < scores[1]), given, coarse), coarse, *seen)
 
 
 @Program
 def approach(
-    options: tuple[ICP, Array | bool], source: Samples, target: Samples, counts: tuple[Array, Array], start: Rigid
+    options: tuple[ICP, Array | bool],
+    source: Samples,
+    target: Samples,
+    counts: tuple[Array, Array],
+    known: Known,
+    start: Rigid,
 ) -> Plan:
     """The plain pose, refined on even samples, and what it calls for.
 
-    Where both clouds hold the same points, these tell the pose, and there is nothing to search for: on a plane, whose
-    samples slide, other poses may well fit better.
+    Where the pose is known there is nothing to refine here or to search for: on a plane, whose samples slide, other
+    poses may well fit better.
     """
     how, always = options
-    transform, width = find_basin(how, source, target, start)
-    same = search.find_counterparts(source.constellations, target.constellations)
-    transform = jax.tree.map(lambda own, other: jnp.where(same.sure, other, own), transform, same.transform)
-    width = jnp.where(same.sure, 0.0, width)
+    kept = known.transform, jnp.zeros_like(known.transform.translation[0])
+    found = jax.lax.cond(anyone(~known.sure), lambda: find_basin(how, source, target, start), lambda: kept)
+    transform, width = rigid.choose(known.sure, kept[0], found[0]), jnp.where(known.sure, kept[1], found[1])
     glance = fit_samples(source.even, target.even, transform, prepared.coarser(source, target))
     fewer = jnp.minimum(*counts)
     dense = fewer >= search.DENSE
-    pending = ~same.sure & (always | (glance.score < jnp.where(dense, _FITS_DENSE, _FITS)))
+    pending = ~known.sure & (always | (glance.score < jnp.where(dense, _FITS_DENSE, _FITS)))
     return Plan(Found(transform, jnp.zeros_like(width), width, pending), pending & dense, fewer > THINNED)
 
 
@@ -291,12 +331,13 @@ def assess(
 
 
 @Program
-def label(_: None, cloud: Prepared, moved: Rigid, encoding: Encoding) -> Array:
+def label(_: None, cloud: Prepared, seen: Seen) -> Array:
     """The region of every point (N,), in the order in which the cloud was given; 0 for padding.
 
     The first argument is shared by the clouds of a batch; here it is nothing.
     """
-    labels = point_regions(rigid.apply(moved, cloud.cloud.points), encoding, count=cloud.count)
+    moved = rigid.apply(seen.moved, cloud.cloud.points)
+    labels = point_regions(moved, seen.cloud, seen.labels, count=cloud.count)
     return jnp.zeros_like(labels).at[cloud.rows].set(jnp.where(cloud.cloud.mask, labels, 0))
 
 
@@ -358,12 +399,14 @@ def register_in_frame(
     sizes = sizes_of(options)
     clouds = call(prepare, sizes, source), call(prepare, sizes, target)
     samples = clouds[0].samples, clouds[1].samples
-    start = call(estimate, model, *samples, told)
+    refined = how is not None or searching is not None
+    known = call(recognise, None, *(each.constellations for each in samples)) if refined else _not_known(source)
+    start = call(estimate, model, *samples, known, told)
     # Where there is no refinement, all that can be unsettled is an initial transform that is not finite.
     pose, settled, steps = start.transform, told.initial_is_finite, np.int32(0)
-    if how is not None or searching is not None:
+    if refined:
         counts = clouds[0].count, clouds[1].count
-        found, quick, thin_first = call(approach, (refiner, always), *samples, counts, start.transform)
+        found, quick, thin_first = call(approach, (refiner, always), *samples, counts, known, start.transform)
         if searching is not None:
             found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
@@ -384,10 +427,19 @@ def register_in_frame(
         transform=pose,
         coarse=start.coarse,
         report=report,
-        source_regions=call(label, None, clouds[0], start.seen, start.source),
-        target_regions=call(label, None, clouds[1], start.still, start.target),
+        source_regions=call(label, None, clouds[0], start.source),
+        target_regions=call(label, None, clouds[1], start.target),
         steps=steps,
     )
+
+
+def _not_known(cloud: Cloud) -> Known:
+    """That the pose is not known, of a pair or a batch with such a cloud."""
+    batch, dtype = cloud.mask.shape[:-1], cloud.points.dtype
+    turn: Any = np.broadcast_to(np.eye(3, dtype=dtype), (*batch, 3, 3))
+    shift: Any = np.zeros((*batch, 3), dtype)
+    sure: Any = np.zeros(batch, bool)
+    return Known(Rigid(turn, shift), sure)
 
 
 def sizes_of(options: Options) -> Sizes:

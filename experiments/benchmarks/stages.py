@@ -35,7 +35,19 @@ from urrt_jax.model.encoding import encode_cloud
 from urrt_jax.model.landmarks import place_landmarks
 from urrt_jax.programs import Program
 from urrt_jax.registration import make_options
-from urrt_jax.stages import approach, assess, compare, estimate, expect, label, prepare, rung, settle, sizes_of
+from urrt_jax.stages import (
+    approach,
+    assess,
+    compare,
+    estimate,
+    expect,
+    label,
+    prepare,
+    recognise,
+    rung,
+    settle,
+    sizes_of,
+)
 
 HERE = Path(__file__).parent
 BATCH = 32
@@ -87,8 +99,11 @@ def measure(data: str) -> dict:
     queries = config.sharpness * jnp.tile(encoded.keys, (1, 2, 1))[:, :count]
     landmarks = jnp.tile(encoded.lookups.places, (1, 3, 1))[:, : count + config.lookups]
     others = landmarks + 0.01 * jax.random.normal(jax.random.key(0), landmarks.shape)
-    start = estimate.batched(model, *samples, told)
-    looked = (refine, False), *samples, (ready[0].count, ready[1].count), start.transform
+    figures = [each.constellations for each in samples]
+    known = recognise.batched(None, *figures)
+    unknown = known._replace(sure=jnp.zeros_like(known.sure))
+    start = estimate.batched(model, *samples, unknown, told)
+    looked = (refine, False), *samples, (ready[0].count, ready[1].count), unknown, start.transform
     found = approach.batched(*looked).found
     settled = settle.batched(refine, *ready, found.transform, found.width)
     last = expect.batched(refine, *ready, settled)
@@ -104,7 +119,9 @@ def measure(data: str) -> dict:
     stages = {
         "prepare both clouds": took(prepare, sizes, source) + took(prepare, sizes, target),
         "– normals of both clouds": milliseconds(normal, tuple(ready)),
-        "the network's steps": took(estimate, model, *samples, told),
+        "recognise the same points": took(recognise, None, *figures),
+        "the network, where all pairs are recognised": took(estimate, model, *samples, known, told),
+        "the network's steps": took(estimate, model, *samples, unknown, told),
         "– surroundings of both clouds": milliseconds(surroundings, small),
         "– of a step: encode the source, its own lookups": milliseconds(encoding, small[0], invariants[0]),
         "– of a step: place the other landmarks, in both clouds": 2 * place,
@@ -114,8 +131,7 @@ def measure(data: str) -> dict:
         "EM-ICP, for the pairs that need it": took(expect, refine, *ready, settled),
         "compare with other poses": took(compare, None, *samples, last.transform),
         "assess": took(assess, True, *ready, last.transform, last.converged, alternatives, told),
-        "regions of both clouds": took(label, None, ready[0], start.seen, start.source)
-        + took(label, None, ready[1], start.still, start.target),
+        "regions of both clouds": took(label, None, ready[0], start.source) + took(label, None, ready[1], start.target),
         "register": 1e3 * median_seconds(whole, 7) / BATCH,
     }
     side = 2048

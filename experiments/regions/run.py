@@ -27,6 +27,7 @@ from urrt_jax.evaluation import find_protocol
 from urrt_jax.frames import normalize_pair
 from urrt_jax.losses import shell_samples
 from urrt_jax.model import Model
+from urrt_jax.model.encoding import Encoding
 from urrt_jax.model.network import encode, estimate_subsampled, point_regions
 from urrt_jax.model.partition import branch_logits, inputs_at_places, occupancy_logits
 from urrt_jax.neighbors import nearest
@@ -68,6 +69,11 @@ class Cut(NamedTuple):
     right: Array
 
 
+def labels_of(points: Array, encoding: Encoding) -> Array:
+    """The regions (N,) of points (N, 3) of an encoded cloud."""
+    return point_regions(points, encoding.cloud, encoding.regions.labels)
+
+
 @jax.jit
 def cut(model: Model, sources: Array, targets: Array, rotations: Array, translations: Array) -> Cut:
     """The regions of B pairs of clouds (B, N, 3) and (B, M, 3), whose true pose is known."""
@@ -81,9 +87,9 @@ def cut(model: Model, sources: Array, targets: Array, rotations: Array, translat
         inputs = inputs_at_places(model.config, answer.target.cloud, places, answer.target.condition)
         occupancy = occupancy_logits(branch_logits(model.config, model.params["partition"], inputs))
         return Cut(
-            source=point_regions(source.points, encode(model, subsample(source, model.config.points))),
-            aligned=point_regions(rigid.apply(answer.seen, source.points), answer.source),
-            target=point_regions(target.points, answer.target),
+            source=labels_of(source.points, encode(model, subsample(source, model.config.points))),
+            aligned=labels_of(rigid.apply(answer.seen, source.points), answer.source),
+            target=labels_of(target.points, answer.target),
             counterpart=found.index,
             near=found.squared < (NEAR / frame.scale) ** 2,
             right=(occupancy > 0) == inside,

@@ -436,14 +436,16 @@ def test_occupancy_can_say_outside():
 def test_point_regions_are_those_that_the_network_used(small_model, pair):
     cloud = make_cloud(pair[0])
     encoding = encode(small_model, cloud)
-    np.testing.assert_array_equal(point_regions(cloud.points, encoding), encoding.regions.labels)
+    labels = encoding.regions.labels
+    np.testing.assert_array_equal(point_regions(cloud.points, encoding.cloud, labels), labels)
 
 
 def test_point_regions_off_the_cloud_are_those_of_the_nearest_point(small_model, pair):
     encoding = encode(small_model, make_cloud(pair[0], np.arange(60) < 50))
     places = np.random.default_rng(0).normal(size=(90, 3))
     near = np.argmin(np.linalg.norm(places[:, None] - pair[0][:50], axis=-1), axis=1)
-    np.testing.assert_array_equal(point_regions(jnp.asarray(places), encoding), encoding.regions.labels[near])
+    labels = encoding.regions.labels
+    np.testing.assert_array_equal(point_regions(jnp.asarray(places), encoding.cloud, labels), labels[near])
 
 
 def _labelled(seed: int = 0):

@@ -18,6 +18,7 @@ from urrt_jax.frames import normalize_pair
 from urrt_jax.model.network import estimate, propose
 from urrt_jax.prepared import Sizes, coarser
 from urrt_jax.refine import ICP
+from urrt_jax.rigid import Known
 from urrt_jax.search import Found, Search
 from urrt_jax.search.search import DENSE, search_thoroughly
 
@@ -296,14 +297,16 @@ def test_a_quick_look_at_another_shape_is_not_sure(look, cloud):
 )
 def test_only_dense_clouds_are_looked_at_quickly(cloud, make_cloud_points, counts, quick):
     samples = _samples(_pad(cloud), _pad(make_cloud_points(1)))
-    plan = stages.approach((ICP(), True), *samples, tuple(map(np.int32, counts)), rigid.identity())
+    unknown = Known(rigid.identity(), np.bool_(False))
+    plan = stages.approach((ICP(), True), *samples, tuple(map(np.int32, counts)), unknown, rigid.identity())
     assert bool(plan.quick) == quick
     assert plan.found.pending
 
 
 def test_clouds_of_the_same_points_are_not_searched(partial):
     samples = _samples(*(_pad(cloud) for cloud in partial(120)))
-    plan = stages.approach((ICP(), True), *samples, (np.int32(DENSE),) * 2, rigid.identity())
+    known = stages.recognise(None, *(each.constellations for each in samples))
+    plan = stages.approach((ICP(), True), *samples, (np.int32(DENSE),) * 2, known, rigid.identity())
     assert not plan.found.pending and not plan.quick
     assert _degrees(plan.found.transform.rotation, _turn(120)) < 0.01
 

@@ -23,7 +23,7 @@ from urrt_jax.model.encoder import PointEncoder, point_inputs
 from urrt_jax.model.encoding import Encoding, encode_cloud
 from urrt_jax.model.partition import init_branches
 from urrt_jax.neighbors import nearest
-from urrt_jax.rigid import Rigid
+from urrt_jax.rigid import Known, Rigid
 
 
 @jax.tree_util.register_dataclass
@@ -77,12 +77,18 @@ def encode(model: Model, cloud: Cloud) -> Encoding:
     return encode_cloud(model.config, model.params, cloud, moment_invariants(cloud, model.config.octaves))
 
 
-def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
+def estimate(model: Model, source: Cloud, target: Cloud, known: Known | None = None) -> Estimate:
     """The transform from source to target, of two clouds normalised together (``normalize_pair``).
 
     The network is applied ``config.steps`` times, each time to the source as moved so far; no derivative passes from
     one step to the one before it. The target is encoded once. Labels of regions carry no derivative (hard arg-max).
     Real points should come first, as ``subsample`` leaves them: among them those are chosen that are looked up.
+
+    Args:
+      model: the network.
+      source: N points.
+      target: M points.
+      known: the pose, where something else tells it: the network then only sees the clouds in it.
     """
     config, params = model.config, model.params
     invariants, target_invariants = each_cloud(lambda cloud: moment_invariants(cloud, config.octaves), source, target)
@@ -93,9 +99,11 @@ def estimate(model: Model, source: Cloud, target: Cloud) -> Estimate:
         moved = jnp.where(source.mask[:, None], rigid.apply(seen, source.points), 0.0)
         encoding = encode_cloud(config, params, source._replace(points=moved), invariants)
         after = rigid.compose(decode(config, params["decoder"], encoding, target_encoding), seen)
+        after = after if known is None else rigid.choose(known.sure, seen, after)
         return after, (after, seen, encoding)
 
-    last, (steps, seen, encodings) = jax.lax.scan(step, rigid.identity(), None, length=config.steps)
+    start = rigid.identity() if known is None else rigid.choose(known.sure, known.transform, rigid.identity())
+    last, (steps, seen, encodings) = jax.lax.scan(step, start, None, length=config.steps)
     final_seen, final_encoding = jax.tree.map(lambda values: values[-1], (seen, encodings))
     return Estimate(last, steps, final_seen, final_encoding, target_encoding)
 
@@ -122,14 +130,15 @@ def predict(model: Model, source: Cloud, target: Cloud) -> Rigid:
     return frame.leave(estimate_subsampled(model, source, target).transform)
 
 
-def point_regions(points: Array, encoding: Encoding, *, count: Array | None = None) -> Array:
+def point_regions(points: Array, cloud: Cloud, labels: Array, *, count: Array | None = None) -> Array:
     """The region (N,) int32 of any points (N, 3) in the network's frame; 0 for model A.
 
     The network sees at most ``config.points`` points of a cloud. A region is that of the nearest one of them.
 
     Args:
       points: on the cloud or off it.
-      encoding: of the cloud whose regions these are.
+      cloud: M points that the network saw (``Encoding.cloud``).
+      labels: (M,), their regions (``Regions.labels``).
       count: (), the points from this row on are padding, whose answers mean nothing; None where all are wanted.
     """
-    return encoding.regions.labels[nearest(points, encoding.cloud, count=count).index]
+    return labels[nearest(points, cloud, count=count).index]

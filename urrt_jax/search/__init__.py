@@ -4,12 +4,11 @@ Where both clouds hold the same points, ``find_counterparts`` finds the pose wit
 """
 
 from urrt_jax.search.config import Search
-from urrt_jax.search.counterparts import Counterparts, find_counterparts
+from urrt_jax.search.counterparts import find_counterparts
 from urrt_jax.search.search import DENSE, Found, search_quickly, search_thoroughly
 
 __all__ = [
     "DENSE",
-    "Counterparts",
     "Found",
     "Search",
     "find_counterparts",

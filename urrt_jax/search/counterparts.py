@@ -1,7 +1,5 @@
 """The pose of two clouds that hold the same points: where surfaces slide, only these tell it."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -9,25 +7,13 @@ from jax import Array
 from urrt_jax import rigid
 from urrt_jax.assessment.fit import trace_and_products
 from urrt_jax.features import Constellations
-from urrt_jax.rigid import Rigid
+from urrt_jax.rigid import Known
 from urrt_jax.search.matches import Matches, poses_from_matches
 
 _ALIKE = 0.01  # spacings by which distances of the same constellation may differ
 _COINCIDE = 0.05  # spacings within which counterparts coincide
 _SUPPORT = 8
 _LEAST, _SHARE = 6, 0.5  # of the matches, that must agree with a pose
-
-
-class Counterparts(NamedTuple):
-    """What constellations say of a pose.
-
-    Attributes:
-      transform: source to target, where most of the constellations that match bring their points together.
-      sure: (), bool, whether these are enough of them to determine the pose.
-    """
-
-    transform: Rigid
-    sure: Array
 
 
 def match_constellations(source: Constellations, target: Constellations) -> Matches:
@@ -39,8 +25,8 @@ def match_constellations(source: Constellations, target: Constellations) -> Matc
     return Matches(jnp.argmax(only, axis=1), jnp.any(only, axis=1))
 
 
-def find_counterparts(source: Constellations, target: Constellations) -> Counterparts:
-    """The pose in which the constellations of two clouds coincide; no derivative passes.
+def find_counterparts(source: Constellations, target: Constellations) -> Known:
+    """The pose in which the constellations of two clouds coincide, known where enough do; no derivative passes.
 
     Args:
       source: K constellations of the source.
@@ -55,7 +41,7 @@ def find_counterparts(source: Constellations, target: Constellations) -> Counter
     there = matches.mutual & (jnp.sum(offsets**2, axis=-1) < (_COINCIDE * unit) ** 2)
     count = jnp.sum(there)
     enough = (count >= _LEAST) & (count >= _SHARE * jnp.sum(matches.mutual))
-    return Counterparts(best, enough & _off_one_line(source.cloud.points, there, unit))
+    return Known(best, enough & _off_one_line(source.cloud.points, there, unit))
 
 
 def _off_one_line(points: Array, chosen: Array, unit: Array) -> Array:
