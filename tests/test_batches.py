@@ -1,13 +1,14 @@
 """Lists of pairs: each answer is that of ``register``, in order, compiled once, whatever is wrong with other pairs."""
 
 import re
+import threading
 
 import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from urrt_jax import Outcome, programs, register, register_pairs, stages, warm_up
+from urrt_jax import Outcome, batches, programs, register, register_pairs, stages, warm_up
 from urrt_jax.programs import clear_programs
 
 SIZES = (200, 150, 300, 180, 260, 199, 120)  # on the rungs 256 and 1,024
@@ -184,6 +185,54 @@ def test_a_pair_that_needs_a_search_is_searched_in_its_batch(call, pairs, small_
     sources = [sources[0] @ turn.T, *sources[1:]]
     result = call(sources, targets)
     _same(result[0], register(sources[0], targets[0], model=small_model))
+
+
+def test_a_pair_whose_pose_is_known_is_the_same_beside_others(call, pairs, small_model):
+    """The network runs for the whole batch then, and must not be asked about the known pair."""
+    sources, targets = (each[:3] for each in pairs)
+    turn = Rotation.from_rotvec([0.0, 1.0, 0.0]).as_matrix().astype(np.float32)
+    copy = sources[0] @ turn.T
+    result = call([sources[0], *sources], [copy, *targets])
+    np.testing.assert_allclose(result[0].coarse.rotation, turn, atol=1e-3)
+    for single, source, target in zip(result, [sources[0], *sources], [copy, *targets], strict=True):
+        expected = register(source, target, model=small_model)
+        _same(single, expected)
+        np.testing.assert_allclose(single.coarse.rotation, expected.coarse.rotation, atol=1e-4)
+        assert np.mean(single.source_regions == expected.source_regions) > 0.98
+
+
+@pytest.fixture
+def threads(monkeypatch) -> set[threading.Thread]:
+    """In which batches are registered from now on."""
+    seen, real = set(), batches._register_batch
+
+    def watched(*arguments):
+        seen.add(threading.current_thread())
+        return real(*arguments)
+
+    monkeypatch.setattr(batches, "_register_batch", watched)
+    return seen
+
+
+def test_batches_are_registered_side_by_side(call, pairs, found, threads):
+    again = call(*(each * 4 for each in pairs))
+    assert threads and threading.main_thread() not in threads
+    np.testing.assert_allclose(again.matrix, np.tile(found.matrix, (4, 1, 1)), atol=1e-4)
+
+
+def test_settings_of_this_thread_hold_for_all_batches(call, pairs, threads):
+    with jax.default_matmul_precision("highest"):
+        call(*pairs)
+    assert threads == {threading.main_thread()}
+
+
+def test_what_goes_wrong_in_a_batch_is_raised(call, pairs, monkeypatch):
+    def broken(*_):
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(batches, "_register_batch", broken)
+    with pytest.raises(MemoryError, match="no room"):
+        call(*(each * 4 for each in pairs))
 
 
 def test_the_network_alone_runs_in_batches(call, pairs, small_model):

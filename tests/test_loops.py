@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from urrt_jax.loops import largest, where_needed, while_each
+from urrt_jax.loops import anyone, largest, where_needed, while_each
 
 _START = np.array([1, 2, 27, 3, 1, 97, 16, 6, 1, 1, 703, 5, 32, 27, 2, 1, 871, 4, 1, 9])  # 0 to 178 steps
 
@@ -292,3 +292,24 @@ def test_largest_makes_one_loop():
     (one,), (other,) = loops(_counted), loops(plain)
     assert all(aval.shape == () for aval in one.in_avals[:2])
     assert any(aval.shape == (6,) for aval in other.in_avals)
+
+
+@pytest.mark.parametrize("flags", [[False, False, False], [False, True, False]])
+def test_anyone_is_one_answer_for_the_whole_batch(flags):
+    """So that a conditional takes one branch, and what the other one would call is not called."""
+    calls = []
+
+    def seen(value):
+        calls.append(value)
+        return value
+
+    def one(flag, value):
+        return jax.lax.cond(
+            anyone(flag), lambda: jax.pure_callback(seen, value, value, vmap_method="expand_dims"), lambda: -value
+        )
+
+    values = jnp.arange(3.0)
+    found = jax.jit(jax.vmap(one))(jnp.array(flags), values)
+    np.testing.assert_array_equal(found, values if any(flags) else -values)
+    assert bool(calls) == any(flags)
+    assert bool(anyone(jnp.array(flags[1]))) == flags[1]

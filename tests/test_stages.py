@@ -119,6 +119,13 @@ def test_a_clean_pair_runs_no_rare_stage(called, call, clean):
     assert set(called) == _USUAL
 
 
+def test_where_both_clouds_hold_the_same_points_the_network_is_not_asked_for_the_pose(call, cloud):
+    turned = _moved(cloud, 150)
+    found = call(cloud, turned)
+    assert _degrees(found.coarse.rotation, _turn(150)) < 0.1
+    assert _degrees(call(cloud, turned, refine=None).coarse.rotation, _turn(150)) > 10
+
+
 def test_a_sparse_noisy_pair_runs_the_third_stage_of_refinement(called, call, sparse):
     call(*sparse, search=None)
     assert set(called) == _USUAL | {"expect"}

@@ -2,7 +2,8 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent import futures
 from typing import Any, Literal, overload
 
 import jax
@@ -15,6 +16,7 @@ from urrt_jax.checks import check_whole
 from urrt_jax.clouds import CloudLike, as_array, check_cloud
 from urrt_jax.host import PairOnHost
 from urrt_jax.model.network import Model
+from urrt_jax.programs import thread_settings
 from urrt_jax.refine import ICP
 from urrt_jax.registration import check_options, check_rigid, make_options, register_on_host, start_compiling
 from urrt_jax.result import OtherPoses, Outcome, Registration
@@ -26,6 +28,7 @@ LARGEST_IN_BATCHES = 4096
 """The most points of clouds that are registered in batches: larger ones keep all cores busy by themselves."""
 
 _FEW = 2  # pairs of a rung that are not worth a program of their own
+_AT_ONCE = 2  # batches: what one leaves idle, between the steps of its loops and on the host, the other uses
 _BATCH_ON_CPU = 32  # twice as many leave the caches of a CPU, and take an eighth longer each
 _BATCH = 64  # on an accelerator; a guess, for which two matrices of 4,096² distances a pair fit into 16 GiB
 _FILLS = {"correspondences": -1, "source_regions": 0, "target_regions": 0}
@@ -175,9 +178,10 @@ def register_pairs(
     reasons: dict[int, str] = {}
     waiting: dict[tuple[int, np.dtype], dict[int, PairOnHost]] = {}  # for a batch of their rung and dtype to be full
     in_batches = set()
-    with tqdm(total=len(sources), desc="registering", unit="pair", file=sys.stderr, disable=not progress) as bar:
+    bar = tqdm(total=len(sources), desc="registering", unit="pair", file=sys.stderr, disable=not progress)
+    with bar, _Workers(bar.update) as workers:
 
-        def run(pairs: dict[int, PairOnHost], size: int, together: bool) -> None:
+        def run(pairs: dict[int, PairOnHost], size: int, together: bool) -> int:
             each = (
                 _register_batch(options, list(pairs.values()), size, batch)
                 if together
@@ -187,7 +191,7 @@ def register_pairs(
                 found[index] = result
                 if not result.converged and (hint := pairs[index].units_hint()):
                     reasons[index] = f"{result.reason}; {hint}"
-                bar.update()
+            return len(pairs)
 
         for index, given in enumerate(zip(sources, targets, starts, strict=True)):
             try:
@@ -199,15 +203,15 @@ def register_pairs(
                 continue
             key = size, _ = rung(pair.size), pair.dtype
             if size > LARGEST_IN_BATCHES or batch == 1:
-                run({index: pair}, size, together=False)
+                bar.update(run({index: pair}, size, together=False))
                 continue
             group = waiting.setdefault(key, {})
             group[index] = pair
             if len(group) == batch:
-                run(waiting.pop(key), size, together=True)
+                workers.start(run, waiting.pop(key), size, together=True)
                 in_batches.add(key)
         for key, group in waiting.items():
-            run(group, key[0], together=key in in_batches or len(group) > _FEW)
+            workers.start(run, group, key[0], together=key in in_batches or len(group) > _FEW)
 
     ordered = [found[index] for index in range(len(sources))]
     sizes = np.array([[len(each.source_regions), len(each.target_regions)] for each in ordered])
@@ -218,6 +222,45 @@ def register_pairs(
 def pairs_at_once() -> int:
     """How many pairs a batch has by default, on the device in use."""
     return _BATCH_ON_CPU if jax.default_backend() == "cpu" else _BATCH
+
+
+class _Workers:
+    """A few threads, in which batches are registered at once; their results are passed to ``done``.
+
+    Settings of JAX that a context manager makes belong to one thread: where there are any, all is done in this one.
+    """
+
+    def __init__(self, done: Callable[[Any], Any]) -> None:
+        self._done = done
+        self._running: set[futures.Future] = set()
+        self._pool = futures.ThreadPoolExecutor(_AT_ONCE)
+        self._alike = self._pool.submit(thread_settings).result() == thread_settings()
+
+    def __enter__(self) -> "_Workers":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, where: Any) -> None:
+        try:
+            if error is None:
+                self._wait(0)
+        finally:
+            self._pool.shutdown(cancel_futures=True)
+
+    def start(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> None:
+        """Calls the function in a thread, when one is free; raises what an earlier call raised."""
+        if not self._alike:
+            self._done(function(*arguments, **named))
+            return
+        self._wait(_AT_ONCE - 1)
+        self._running.add(self._pool.submit(function, *arguments, **named))
+
+    def _wait(self, most: int) -> None:
+        """Returns when at most so many calls are running."""
+        while len(self._running) > most:
+            # Short waits let Ctrl-C through on every system.
+            done, self._running = futures.wait(self._running, timeout=0.1, return_when=futures.FIRST_COMPLETED)
+            for each in done:
+                self._done(each.result())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jax import Array
 
 from urrt_jax.clouds import Cloud, centroid, curve_order, first, normals, subsample, take, thin
 from urrt_jax.features import Constellations, constellations
-from urrt_jax.neighbors import LARGE, LEAST_SPACING, Blocks, make_blocks, nearest, spacing
+from urrt_jax.neighbors import LARGE, LEAST_SPACING, Blocks, make_blocks, nearest, spacing, typical_distance
 
 THINNED = 4096
 """Points of a thinned cloud: normals are made from them, and the first steps of a large pair's refinement."""
@@ -80,12 +80,14 @@ def prepare(sizes: Sizes, cloud: Cloud) -> Prepared:
     count = jnp.sum(cloud.mask)
     blocks = make_blocks(cloud, ordered=True) if cloud.points.shape[0] > LARGE else None
     measured = thin(cloud, _SPACING_POINTS, ordered=True)
-    width = jnp.maximum(spacing(cloud, blocks=blocks, sample=measured), LEAST_SPACING)
+    apart = nearest(measured.points, cloud, blocks=blocks, distinct=True, ordered=blocks is not None).squared
+    width = jnp.maximum(typical_distance(apart, measured.mask), LEAST_SPACING)
     thinned, queries = (thin(cloud, size, ordered=True) for size in (THINNED, sizes.queries))
     radius = sizes.normal_radius * thinned_spacing(count, width)
     even = subsample(thinned, sizes.sample)
     known = thinned._replace(mask=thinned.mask & (count <= THINNED))
-    apart = nearest(known.points, known, distinct=True).squared
+    if measured.points.shape != known.points.shape:  # else the same points
+        apart = nearest(known.points, known, distinct=True).squared
     samples = Samples(
         even=even,
         spacing=jnp.maximum(spacing(even), LEAST_SPACING),

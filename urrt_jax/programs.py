@@ -24,6 +24,7 @@ __all__ = [
     "clear_programs",
     "compile_ahead",
     "is_debugging",
+    "thread_settings",
     "use_compilation_cache",
     "wait_until_ready",
 ]
@@ -230,6 +231,11 @@ def compile_ahead(key: Hashable, call: Callable[[], Any]) -> None:
 def is_debugging() -> bool:
     """Whether a setting of JAX for debugging is on, under which programs on arrays are not compiled ahead of time."""
     return any(map(_setting, _DEBUGGING))
+
+
+def thread_settings() -> tuple:
+    """The settings of JAX that decide what a program does; context managers change them for one thread."""
+    return tuple(map(_setting, _SETTINGS + _DEBUGGING))
 
 
 def clear_programs() -> None:

@@ -7,7 +7,16 @@ import pytest
 from scipy.spatial import cKDTree
 
 from urrt_jax.clouds import Cloud, make_cloud
-from urrt_jax.neighbors import LEAST_SPACING, coarser_spacing, k_nearest, make_blocks, nearest, spacing, top_rows
+from urrt_jax.neighbors import (
+    LEAST_SPACING,
+    coarser_spacing,
+    k_nearest,
+    make_blocks,
+    nearest,
+    spacing,
+    top_rows,
+    typical_distance,
+)
 
 _nearest = jax.jit(nearest, static_argnames="block")
 _k_nearest = jax.jit(k_nearest, static_argnames=("k", "batch_size"))
@@ -205,14 +214,16 @@ def test_the_coarser_spacing_of_coincident_points_is_not_zero():
 
 def test_spacing_through_blocks_is_that_of_comparing_all():
     cloud = make_cloud(np.random.default_rng(0).normal(size=(700, 3)).astype(np.float32))
-    through = jax.jit(lambda each: spacing(each, blocks=make_blocks(each)))(cloud)
+    far = jax.jit(lambda each: nearest(each.points, each, blocks=make_blocks(each), distinct=True).squared)(cloud)
+    through = typical_distance(far, cloud.mask)
     assert float(through) == pytest.approx(float(_spacing(cloud)), rel=1e-6)
 
 
 def test_spacing_of_a_sample_is_asked_in_the_whole_cloud():
     cloud = make_cloud(_grid(0.5))
     sample = make_cloud(_grid(0.5)[::31])
-    assert float(_spacing(cloud, sample=sample)) == pytest.approx(0.5, rel=1e-5)
+    squared = nearest(sample.points, cloud, distinct=True).squared
+    assert float(typical_distance(squared, sample.mask)) == pytest.approx(0.5, rel=1e-5)
 
 
 @pytest.mark.parametrize("distance", [10.0, 1e3, 1e6])

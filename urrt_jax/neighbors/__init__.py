@@ -10,6 +10,7 @@ from urrt_jax.neighbors.nearest import (
     nearest,
     spacing,
     top_rows,
+    typical_distance,
 )
 
 __all__ = [
@@ -23,4 +24,5 @@ __all__ = [
     "nearest",
     "spacing",
     "top_rows",
+    "typical_distance",
 ]

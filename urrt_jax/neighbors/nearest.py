@@ -181,21 +181,23 @@ def coarser_spacing(source: Cloud, target: Cloud) -> Array:
     return jnp.maximum(jnp.max(jax.lax.map(spacing, both)), LEAST_SPACING)
 
 
-def spacing(cloud: Cloud, *, blocks: Blocks | None = None, sample: Cloud | None = None) -> Array:
+def spacing(cloud: Cloud) -> Array:
     """The root-mean-square distance from a real point to its nearest other point, (): the cloud's own resolution.
 
     Points that coincide say nothing about it and are passed over; distances count as three times their median at most,
     so that stray points don't set it. 0 for fewer than two distinct points.
+    """
+    return typical_distance(nearest(cloud.points, cloud, distinct=True).squared, cloud.mask)
+
+
+def typical_distance(squared: Array, mask: Array) -> Array:
+    """The spacing, (), of a cloud, some of whose points (N,) have their nearest other point at these squared distances.
 
     Args:
-      cloud: N points.
-      blocks: ``make_blocks`` of a large cloud, where it is at hand; ``sample`` is then taken to follow the curve.
-      sample: some of its points at which to measure, when the cloud is large.
+      squared: (N,), inf where there is none.
+      mask: (N,) bool, False for padding.
     """
-    sample = cloud if sample is None else sample
-    ordered = blocks is not None
-    squared = nearest(sample.points, cloud, blocks=blocks, distinct=True, ordered=ordered).squared
-    usable = sample.mask & jnp.isfinite(squared)
+    usable = mask & jnp.isfinite(squared)
     count = jnp.sum(usable)
     median = jnp.sort(jnp.where(usable, squared, jnp.inf))[count // 2]
     mean = jnp.sum(jnp.where(usable, jnp.minimum(squared, 9.0 * median), 0.0)) / jnp.maximum(count, 1)
