@@ -86,7 +86,7 @@ def each_cloud(function: Callable[[Any], Any], source: Any, target: Any) -> tupl
 
 @custom_vmap
 def largest(count: Array) -> Array:
-    """The count, (); under ``vmap`` the largest of the batch, so that a loop up to it is one loop for all."""
+    """The count or flag, (); under ``vmap`` the largest of the batch, so that a loop up to it is one loop for all."""
     return count
 
 
@@ -95,15 +95,9 @@ def _largest_of_batch(size: int, batched: list[bool], count: Array) -> tuple[Arr
     return largest(jnp.max(count)), False
 
 
-@custom_vmap
 def anyone(flag: Array) -> Array:
     """The flag, (); under ``vmap`` whether it is set anywhere in the batch, so that ``cond`` still takes one branch."""
-    return flag
-
-
-@anyone.def_vmap
-def _anyone_of_batch(size: int, batched: list[bool], flag: Array) -> tuple[Array, bool]:
-    return anyone(jnp.any(flag)), False
+    return largest(flag)
 
 
 def _queue(unfinished: Callable, step: Callable, start: Any, context: Any, batched: Any, places: int) -> Any:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-_TINY = 1e-6  # of a probability
+_TINY = 1e-7  # of a probability
 _EVENNESS = 0.5  # how much the entropy counts beside the mutual information
 
 
