@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from urrt_jax.loops import anyone, largest, where_needed, while_each
+from urrt_jax.loops import anyone, largest, only_if, where_needed, while_each
 
 _START = np.array([1, 2, 27, 3, 1, 97, 16, 6, 1, 1, 703, 5, 32, 27, 2, 1, 871, 4, 1, 9])  # 0 to 178 steps
 
@@ -313,3 +313,15 @@ def test_anyone_is_one_answer_for_the_whole_batch(flags):
     np.testing.assert_array_equal(found, values if any(flags) else -values)
     assert bool(calls) == any(flags)
     assert bool(anyone(jnp.array(flags[1]))) == flags[1]
+
+
+def test_only_if_computes_what_is_needed_and_nothing_else():
+    calls = []
+
+    def costly():
+        return jax.pure_callback(lambda: calls.append(1) or np.float32(3), jax.ShapeDtypeStruct((), jnp.float32))
+
+    found = jax.jit(lambda needed: only_if(needed, costly, jnp.float32(0)))
+    assert found(False) == 0 and not calls
+    assert found(True) == 3 and calls
+    assert "cond" not in str(jax.make_jaxpr(lambda: only_if(True, costly, jnp.float32(0)))())

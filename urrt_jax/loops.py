@@ -84,6 +84,11 @@ def each_cloud(function: Callable[[Any], Any], source: Any, target: Any) -> tupl
     return jax.tree.map(lambda leaf: leaf[0], both), jax.tree.map(lambda leaf: leaf[1], both)
 
 
+def only_if(needed: Array | bool, function: Callable[[], Any], otherwise: Any) -> Any:
+    """``function()`` where it is ``needed``, (), else what has its structure. A Python ``True`` costs no ``cond``."""
+    return function() if needed is True else jax.lax.cond(needed, function, lambda: otherwise)
+
+
 @custom_vmap
 def largest(count: Array) -> Array:
     """The count or flag, (); under ``vmap`` the largest of the batch, so that a loop up to it is one loop for all."""

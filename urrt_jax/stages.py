@@ -34,7 +34,6 @@ whatever the clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole
 of the ladder, as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
 """
 
-import dataclasses
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -60,8 +59,8 @@ from urrt_jax.assessment import (
 )
 from urrt_jax.clouds import Cloud, first, mean_square_radius
 from urrt_jax.features import Constellations
-from urrt_jax.loops import anyone, each_cloud, where_needed
-from urrt_jax.model.network import Model, encode, point_regions
+from urrt_jax.loops import anyone, where_needed
+from urrt_jax.model.network import Model, point_regions
 from urrt_jax.model.network import estimate as apply_network
 from urrt_jax.prepared import THINNED, Prepared, Samples, Sizes
 from urrt_jax.programs import Program
@@ -210,23 +209,8 @@ def estimate(model: Model, source: Samples, target: Samples, known: Known, told:
     nothing = rigid.identity()
     clouds = first(source.even, model.config.points), first(target.even, model.config.points)
 
-    def look_for_pose() -> tuple[Rigid, Seen, Seen]:
-        answer = apply_network(model, *clouds, known)
-        moved = Seen(answer.seen, answer.source.cloud, answer.source.regions.labels)
-        return answer.transform, moved, Seen(nothing, answer.target.cloud, answer.target.regions.labels)
-
-    def take_known_pose() -> tuple[Rigid, Seen, Seen]:
-        idle = dataclasses.replace(model, config=dataclasses.replace(model.config, lookups=0))
-
-        def look(pose: Rigid, cloud: Cloud) -> Seen:
-            moved = jnp.where(cloud.mask[:, None], rigid.apply(pose, cloud.points), 0.0)
-            found = encode(idle, cloud._replace(points=moved))
-            return Seen(pose, found.cloud, found.regions.labels)
-
-        seen = each_cloud(lambda each: look(*each), (known.transform, clouds[0]), (nothing, clouds[1]))
-        return known.transform, *seen
-
-    coarse, *seen = jax.lax.cond(anyone(~known.sure), look_for_pose, take_known_pose)
+    answer = apply_network(model, *clouds, known)
+    coarse = answer.transform
     given = Rigid(nothing.rotation, told.offset)
     poses = jax.tree.map(lambda *leaves: jax.lax.stop_gradient(jnp.stack(leaves)), coarse, given)
     even = source.even, target.even
@@ -235,7 +219,12 @@ def estimate(model: Model, source: Samples, target: Samples, known: Known, told:
         lambda: agreement(poses, even, even, prepared.coarser(source, target)),
         lambda: jnp.zeros(2, poses.translation.dtype),
     )
-    return Start(rigid.choose(~known.sure & (scores[0] < scores[1]), given, coarse), coarse, *seen)
+    return Start(
+        transform=rigid.choose(~known.sure & (scores[0] < scores[1]), given, coarse),
+        coarse=coarse,
+        source=Seen(answer.seen, answer.source.cloud, answer.source.regions.labels),
+        target=Seen(nothing, answer.target.cloud, answer.target.regions.labels),
+    )
 
 
 @Program

@@ -10,12 +10,14 @@ points, which is where regions should help: a region may be seen in both clouds 
   regions. Model A, which has none, has as many landmarks as the regions of the others together. pose: decoders regress
   the pose, and points are known by their coordinates alone.
 
-Every model trains for the same time on one processor, by which its steps are chosen: how fast it is, is measured first.
-Checkpoints are chosen on shapes held out of the training split. Errors are over every fourth test shape (RPM-Net's
-crops: all of its subset), one step, without refinement. A model's ratio to A is that of the mean errors, with an
-interval that holds 95 % of resampled sets of pairs and seeds. Runs are kept in runs/ beside this file: an interrupted
-command continues where it stopped, and commands with other names may run beside each other. Writes equal_time.json and
-equal_time.md, with the models that are there.
+Every model trains for the same time on one processor, by which its steps are chosen: how fast each is, is measured
+first, and kept with the results, so that a model trains for as many steps wherever the command goes on. Checkpoints are
+chosen on shapes held out of the training split. Errors are over every fourth test shape (RPM-Net's crops: all of its
+subset), one step, without refinement. A model's ratio to A is that of the mean errors, with an interval that holds 95 %
+of resampled sets of pairs and seeds.
+
+Writes equal_time.json and equal_time.md with the models that are there. An interrupted command continues where it
+stopped: finished models are in equal_time.json, the one at work in runs/, both beside this file.
 """
 
 import argparse
@@ -85,20 +87,28 @@ def folder(name: str) -> Path:
     return HERE / "runs" / name.replace(", ", "_")
 
 
-def steps_in(minutes: float, name: str, shapes: Shapes) -> int:
-    """The steps that a model trains in so many minutes here; measured once, and kept beside its runs."""
-    path = folder(name) / "steps_per_second.json"
-    if not path.exists():
-        config, arrays = configured(name, 100, 0), {"points": jnp.asarray(shapes.points[:256])}
-        state, _ = train_steps(init_state(config), arrays, config)  # compiles
-        jax.block_until_ready(state)
-        start = time.perf_counter()
-        for _ in range(8):
-            state, _ = train_steps(state, arrays, config)
-        jax.block_until_ready(state)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(8 / (time.perf_counter() - start)))
-    return max(20, round(60 * minutes * json.loads(path.read_text())))
+def speed(name: str, shapes: Shapes) -> float:
+    """The steps that a model trains in a second here."""
+    config, arrays = configured(name, 100, 0), {"points": jnp.asarray(shapes.points[:256])}
+    state, _ = train_steps(init_state(config), arrays, config)  # compiles
+    jax.block_until_ready(state)
+    start = time.perf_counter()
+    for _ in range(8):
+        state, _ = train_steps(state, arrays, config)
+    jax.block_until_ready(state)
+    return 8 / (time.perf_counter() - start)
+
+
+def begin(path: Path, settings: dict[str, Any], shapes: Shapes) -> dict[str, Any]:
+    """What the results file holds, or, where it is of other settings, one without rows, and with speeds measured."""
+    results = json.loads(path.read_text()) if path.exists() else {}
+    if results.get("settings") == settings:
+        return results
+    speeds = {name: round(speed(name, shapes), 3) for name in tqdm(MODELS, desc="speeds", unit="model")}
+    command = f"python experiments/ablation/equal_time.py --data {settings['data']} --minutes {settings['minutes']:g}"
+    results = {"command": command, "jax": jax.__version__, "settings": settings, "speeds": speeds, "rows": []}
+    write_atomically(path, json.dumps(results) + "\n")
+    return results
 
 
 def measured(name: str, seed: int, steps: int, shapes: Shapes, test: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -162,18 +172,14 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def keep(row: dict[str, Any], data: str, minutes: float) -> None:
-    """Writes a row beside those that are there, of the same data and time."""
-    path, settings = HERE / "equal_time.json", {"data": data, "minutes": minutes}
-    before = json.loads(path.read_text()) if path.exists() else {}
-    same = before.get("rows", []) if before.get("settings") == settings else []
-    rows = {(each["model"], each["seed"]): each for each in [*same, row]}
+def keep(path: Path, row: dict[str, Any]) -> None:
+    """Writes a row beside those that are there, and the table of all."""
+    results = json.loads(path.read_text())
+    rows = {(each["model"], each["seed"]): each for each in [*results["rows"], row]}
     order = list(MODELS)
-    ordered = sorted(rows.values(), key=lambda each: (order.index(each["model"]), each["seed"]))
-    command = f"python experiments/ablation/equal_time.py --data {data}"
-    results = {"command": command, "jax": jax.__version__, "settings": settings, "rows": ordered}
+    results["rows"] = sorted(rows.values(), key=lambda each: (order.index(each["model"]), each["seed"]))
     write_atomically(path, json.dumps(results) + "\n")
-    write_atomically(HERE / "equal_time.md", as_markdown(ordered))
+    write_atomically(path.with_suffix(".md"), as_markdown(results["rows"]))
 
 
 if __name__ == "__main__":
@@ -186,8 +192,11 @@ if __name__ == "__main__":
     shapes = load_shapes(flags.data, points=1024)
     test = dict.fromkeys(PROTOCOLS, load_shapes(flags.data, split="test", points=1024).points[::STRIDE])
     test["rpmnet"] = load_shapes(str(Path(flags.data) / RPMNET), split="test", points=2048).points
-    todo = [(name, seed) for seed in flags.seeds for name in flags.only]
-    for name, seed in tqdm(todo, unit="run"):
-        steps = steps_in(flags.minutes, name, shapes)
-        keep(measured(name, seed, steps, shapes, test), Path(flags.data).name, flags.minutes)
-    print((HERE / "equal_time.md").read_text())
+    path, settings = HERE / "equal_time.json", {"data": Path(flags.data).name, "minutes": flags.minutes}
+    results = begin(path, settings, shapes)
+    there = {(row["model"], row["seed"]) for row in results["rows"]}
+    todo = [(name, seed) for seed in flags.seeds for name in flags.only if (name, seed) not in there]
+    for name, seed in tqdm(todo, desc="models", unit="run"):
+        steps = max(20, round(60 * flags.minutes * results["speeds"][name]))
+        keep(path, measured(name, seed, steps, shapes, test))
+    print(path.with_suffix(".md").read_text())

@@ -52,16 +52,21 @@ def test_interval_holds_the_true_ratio_and_narrows_with_pairs(ablation):
     assert widths[1] < widths[0] / 3
 
 
-def test_rows_are_kept_beside_each_other_while_data_and_time_are_the_same(ablation, tmp_path):
+def test_rows_are_kept_beside_each_other_while_data_and_time_are_the_same(ablation, tmp_path, monkeypatch):
+    measured = []
+    monkeypatch.setattr(ablation, "speed", lambda name, _: measured.append(name) or 1.5)
+    path, settings = tmp_path / "rows.json", {"data": "data", "minutes": 6.0}
+    speeds = ablation.begin(path, settings, None)["speeds"]
+    assert speeds == dict.fromkeys(ablation.MODELS, 1.5)
     for name, seed in (("C, parts, pose", 1), ("A, pose", 0), ("C, parts, pose", 0), ("A, pose", 0)):
-        ablation.keep(_row(ablation, name, seed), "data", 6.0)
-    rows = json.loads((tmp_path / "equal_time.json").read_text())["rows"]
-    assert [(row["model"], row["seed"]) for row in rows] == [
+        ablation.keep(path, _row(ablation, name, seed))
+    results = ablation.begin(path, settings, None)
+    assert [(row["model"], row["seed"]) for row in results["rows"]] == [
         ("A, pose", 0), ("C, parts, pose", 0), ("C, parts, pose", 1)
     ]  # fmt: skip
-    assert "C, parts, pose, 2 seeds" in (tmp_path / "equal_time.md").read_text()
-    ablation.keep(_row(ablation, "A, pose"), "data", 7.0)
-    assert len(json.loads((tmp_path / "equal_time.json").read_text())["rows"]) == 1
+    assert "C, parts, pose, 2 seeds" in path.with_suffix(".md").read_text()
+    assert measured == list(ablation.MODELS)  # once: the same models train for as many steps on another machine
+    assert ablation.begin(path, settings | {"minutes": 7.0}, None)["rows"] == []
 
 
 def test_table_of_a_model_whose_base_is_missing_has_no_ratio(ablation):

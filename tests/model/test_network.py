@@ -15,7 +15,7 @@ from urrt_jax import rigid
 from urrt_jax.clouds import make_cloud
 from urrt_jax.features import moment_invariants
 from urrt_jax.frames import normalize_pair
-from urrt_jax.model import Model, ModelConfig, estimate, init_model
+from urrt_jax.model import Model, ModelConfig, estimate, init_model, network
 from urrt_jax.model.attention import attention_weights
 from urrt_jax.model.encoder import encode_points, shape_embedding
 from urrt_jax.model.network import encode, point_regions, predict, propose
@@ -71,6 +71,57 @@ def test_aligned_clouds_are_proposed_to_stay(model, pair, x64):
         assert len(proposed.rotation) == 1
     assert model.config.decoder == "pose" or len(proposed.rotation) >= 8
     _close(proposed, jax.vmap(lambda _: expected)(proposed.translation), atol=1e-4)
+
+
+@pytest.fixture
+def count_calls(monkeypatch):
+    """Of the network's functions with these names: how often each runs, as the compiled program runs."""
+    counts = {}
+
+    def watch(name):
+        inner = getattr(network, name)
+
+        def counted(*arguments):
+            jax.debug.callback(lambda: counts.update({name: counts.get(name, 0) + 1}))
+            return inner(*arguments)
+
+        monkeypatch.setattr(network, name, counted)
+
+    def run(names, function, *arguments):
+        for name in names:
+            watch(name)
+        answer = jax.block_until_ready(jax.jit(function)(*arguments))
+        jax.effects_barrier()
+        return answer, counts
+
+    return run
+
+
+@pytest.mark.parametrize("sure", [[True, True], [False, True]])
+def test_known_poses_are_taken_and_nothing_is_decoded_where_all_are_known(small_model, pair, count_calls, sure):
+    clouds = [jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), make_cloud(points)) for points in pair]
+    turns = jax.vmap(rigid.rotation_from_6d)(jax.random.normal(jax.random.key(0), (2, 6)))
+    transform = rigid.Rigid(turns, jnp.full((2, 3), 0.1))
+    batch = jax.vmap(functools.partial(network.estimate, small_model))
+    names = ["decode", "encode_cloud"]
+    answer, counts = count_calls(names, batch, *clouds, rigid.Known(transform, jnp.array(sure)))
+    steps = small_model.config.steps
+    assert steps > 1
+    # Once for the target, and then for every step; each callback runs once a pair of the batch, or once in all.
+    if all(sure):
+        assert "decode" not in counts and counts["encode_cloud"] in (2, 4)
+    else:
+        assert counts["decode"] in (steps, 2 * steps) and counts["encode_cloud"] in (1 + steps, 2 * (1 + steps))
+    plain = _estimate(small_model, *(jax.tree.map(lambda leaf: leaf[0], cloud) for cloud in clouds))
+    for row, known in enumerate(sure):
+        found = jax.tree.map(lambda leaf, row=row: leaf[row], answer)
+        expected = jax.tree.map(lambda leaf, row=row: leaf[row], transform) if known else plain.transform
+        _close(found.transform, expected, atol=1e-6 if known else 1e-4)
+        _close(jax.tree.map(lambda leaf: leaf[-1], found.steps), expected, atol=1e-4)
+        assert len(found.steps.translation) == steps
+        if known:
+            _close(found.seen, expected)
+            np.testing.assert_allclose(found.source.cloud.points, rigid.apply(expected, pair[0]), atol=1e-5)
 
 
 def test_random_model_does_not_answer_the_identity(model, pair):

@@ -8,6 +8,7 @@ from urrt_jax.clouds.cloud import Cloud
 from urrt_jax.rigid import cross
 
 _AT_ONCE = 128  # points whose neighbourhoods are summed at once
+_FAR = 1e18  # radii; its square is still a float32 number
 _HIGHEST = jax.lax.Precision.HIGHEST
 _SINGULAR = 2e-3  # what rounding, of which arccos makes its root, leaves of a cross product that should vanish
 
@@ -49,10 +50,11 @@ def _spreads(points: Array, cloud: Cloud, radius: Array) -> Array:
         in_order = jnp.sort(jax.lax.stop_gradient(queries), axis=0)
         centre = (in_order[few // 4] + in_order[-1 - few // 4]) / 2
         at, others = (queries - centre) / radius, (cloud.points - centre) / radius
-        others = jnp.where(cloud.mask[:, None], others, 0.0)
-        squared = sum((at[:, None, k] - others[None, :, k]) ** 2 for k in range(3))
-        near = jax.lax.stop_gradient((cloud.mask & (squared < 1)).astype(points.dtype))
-        x, y, z = others.T
+        # Padding lies far away, which costs less than to ask the mask again of every query.
+        apart = jnp.where(cloud.mask[:, None], others, _FAR)
+        squared = sum((at[:, None, k] - apart[None, :, k]) ** 2 for k in range(3))
+        near = jax.lax.stop_gradient(jnp.where(squared < 1, jnp.ones_like(squared), 0.0))
+        x, y, z = jnp.where(cloud.mask, others.T, 0.0)
         moments = jnp.stack([jnp.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
         return jnp.matmul(near, moments, precision=_HIGHEST)
 

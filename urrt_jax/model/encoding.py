@@ -33,8 +33,13 @@ class Encoding(NamedTuple):
     lookups: Lookups
 
 
-def encode_cloud(config: ModelConfig, params: dict, cloud: Cloud, invariants: Array) -> Encoding:
-    """The encoding of a normalised cloud of N points with the invariants (N, q) of their surroundings."""
+def encode_cloud(
+    config: ModelConfig, params: dict, cloud: Cloud, invariants: Array, decoded: Array | bool = True
+) -> Encoding:
+    """The encoding of a normalised cloud of N points with the invariants (N, q) of their surroundings.
+
+    Where it will not be ``decoded``, (), nothing is looked up, and places of look-ups are zero.
+    """
     features, embedding = encode_points(config, params["encoder"], cloud, invariants)
     if config.has_regions:
         inputs = inputs_of_cloud(config, cloud, embedding, invariants)
@@ -47,4 +52,4 @@ def encode_cloud(config: ModelConfig, params: dict, cloud: Cloud, invariants: Ar
         keys = jnp.zeros((features.shape[0], 0), features.dtype)
     else:
         keys = point_keys(config, params["decoder"], features, invariants)
-    return Encoding(cloud, embedding, condition, regions, keys, look_up(config, keys, cloud))
+    return Encoding(cloud, embedding, condition, regions, keys, look_up(config, keys, cloud, decoded))

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax.clouds import Cloud
+from urrt_jax.loops import only_if
 from urrt_jax.model.blocks import Perceptron, region_perceptrons, run
 from urrt_jax.model.config import ModelConfig
 
@@ -120,15 +121,17 @@ def point_trust() -> nn.Module:
     return Perceptron((32, 1), normalize=True)
 
 
-def look_up(config: ModelConfig, keys: Array, cloud: Cloud) -> Lookups:
+def look_up(config: ModelConfig, keys: Array, cloud: Cloud, needed: Array | bool = True) -> Lookups:
     """The points of a cloud, with their keys (N, c), that are looked up: evenly spread.
 
-    Outliers are first among farthest ones.
+    Outliers are first among farthest ones. Where this is not ``needed``, (), places are zero.
     """
     rows, real = jnp.arange(min(config.lookups, cloud.mask.shape[0])), jnp.sum(cloud.mask)
     rows = jnp.where(real > rows.shape[0], rows * real // max(rows.shape[0], 1), rows)
     asked = keys[rows]
-    return Lookups(asked, cloud.mask[rows], place_landmarks(config.sharpness * asked, keys, cloud))
+    blank = jnp.zeros((rows.shape[0], 3), cloud.points.dtype)
+    places = only_if(needed, lambda: place_landmarks(config.sharpness * asked, keys, cloud), blank)
+    return Lookups(asked, cloud.mask[rows], places)
 
 
 def lookup_weights(config: ModelConfig, params: dict, keys: Array, real: Array) -> Array:

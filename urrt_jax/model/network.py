@@ -15,7 +15,7 @@ from urrt_jax import rigid
 from urrt_jax.clouds import Cloud, subsample
 from urrt_jax.features.moments import moment_invariants
 from urrt_jax.frames import normalize_pair
-from urrt_jax.loops import each_cloud
+from urrt_jax.loops import anyone, each_cloud, only_if
 from urrt_jax.model.attention import RegionTransformer
 from urrt_jax.model.config import ModelConfig
 from urrt_jax.model.decoder import decode, decode_hypotheses, init_decoder
@@ -37,6 +37,14 @@ class Model:
     def at_most(self, steps: int) -> "Model":
         """The same network, applied as often as before but not more often than this."""
         return dataclasses.replace(self, config=dataclasses.replace(self.config, steps=min(steps, self.config.steps)))
+
+
+class _Step(NamedTuple):
+    """What a step leaves: the pose that it finds, the pose in which it saw the source, and what it saw."""
+
+    pose: Rigid
+    seen: Rigid
+    encoding: Encoding
 
 
 class Estimate(NamedTuple):
@@ -88,24 +96,32 @@ def estimate(model: Model, source: Cloud, target: Cloud, known: Known | None = N
       model: the network.
       source: N points.
       target: M points.
-      known: the pose, where something else tells it: the network then only sees the clouds in it.
+      known: the pose, where something else tells it: the network then only sees the clouds in it. Where all poses of
+        a batch are known, nothing is decoded, and the clouds are seen once.
     """
     config, params = model.config, model.params
+    needed = True if known is None else anyone(~known.sure)
     invariants, target_invariants = each_cloud(lambda cloud: moment_invariants(cloud, config.octaves), source, target)
-    target_encoding = encode_cloud(config, params, target, target_invariants)
+    target_encoding = encode_cloud(config, params, target, target_invariants, needed)
 
-    def step(before: Rigid, _: None) -> tuple[Rigid, tuple[Rigid, Rigid, Encoding]]:
-        seen = jax.tree.map(jax.lax.stop_gradient, before)
+    @jax.jit  # so that it is traced once
+    def apply(pose: Rigid) -> _Step:
+        seen = jax.tree.map(jax.lax.stop_gradient, pose)
         moved = jnp.where(source.mask[:, None], rigid.apply(seen, source.points), 0.0)
-        encoding = encode_cloud(config, params, source._replace(points=moved), invariants)
-        after = rigid.compose(decode(config, params["decoder"], encoding, target_encoding), seen)
-        after = after if known is None else rigid.choose(known.sure, seen, after)
-        return after, (after, seen, encoding)
+        encoding = encode_cloud(config, params, source._replace(points=moved), invariants, needed)
+        decoded = lambda: rigid.compose(decode(config, params["decoder"], encoding, target_encoding), seen)  # noqa: E731
+        pose = only_if(needed, decoded, seen)
+        return _Step(pose if known is None else rigid.choose(known.sure, seen, pose), seen, encoding)
 
-    start = rigid.identity() if known is None else rigid.choose(known.sure, known.transform, rigid.identity())
-    last, (steps, seen, encodings) = jax.lax.scan(step, start, None, length=config.steps)
-    final_seen, final_encoding = jax.tree.map(lambda values: values[-1], (seen, encodings))
-    return Estimate(last, steps, final_seen, final_encoding, target_encoding)
+    def step(now: _Step, first: Array) -> tuple[_Step, Rigid]:
+        now = only_if(needed is True or (needed | first), lambda: apply(now.pose), now)
+        return now, now.pose
+
+    pose = rigid.identity() if known is None else rigid.choose(known.sure, known.transform, rigid.identity())
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(apply, pose))
+    start = nothing._replace(pose=pose)
+    last, steps = jax.lax.scan(step, start, jnp.arange(config.steps) == 0)
+    return Estimate(last.pose, steps, last.seen, last.encoding, target_encoding)
 
 
 def propose(model: Model, source: Cloud, target: Cloud, count: int) -> Rigid:
