@@ -1,7 +1,5 @@
 """The ablation at equal time: its ratios and intervals, and that rows are kept while they compare."""
 
-import json
-
 import numpy as np
 import pytest
 

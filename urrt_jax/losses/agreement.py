@@ -1,7 +1,6 @@
 """Agreement of regions: high if the region of a point predicts that of its counterpart, and regions are even.
 
-The first is the mutual information of both regions, the second the entropy of the regions' sizes. If all points lie in
-one region both are zero, although regions agree.
+It is the mutual information of both regions. If all points lie in one region it is zero, although regions agree.
 """
 
 import jax
@@ -9,7 +8,6 @@ import jax.numpy as jnp
 from jax import Array
 
 _TINY = 1e-7  # of a probability
-_EVENNESS = 0.5  # how much the entropy counts beside the mutual information
 
 
 def region_pairs(source: Array, target: Array, weights: Array) -> Array:
@@ -24,11 +22,10 @@ def region_pairs(source: Array, target: Array, weights: Array) -> Array:
 
 
 def region_agreement(pairs: Array) -> Array:
-    """The mutual information of both regions of a pair of points, plus half the entropy of one, (), in nats.
+    """The mutual information of both regions of a pair of points, (), in nats.
 
-    It is between 0 and 1.5 ln n; 0 where no pair counts. Without the entropy, training left four or five of eight
-    regions. The order of the clouds does not matter: the table is made symmetric first (Ji et al. 2019, invariant
-    information clustering: eq. 3, and both regions' entropies weighed by λ = 1.25).
+    It is between 0 and ln n; 0 where no pair counts. The order of the clouds does not matter: the table is made
+    symmetric first (Ji et al. 2019, invariant information clustering: eq. 3).
 
     Args:
       pairs: (n, n), at least zero (``region_pairs``).
@@ -36,7 +33,7 @@ def region_agreement(pairs: Array) -> Array:
     Example:
       >>> import jax.numpy as jnp
       >>> round(float(region_agreement(jnp.eye(4)) / jnp.log(4)), 2)
-      1.5
+      1.0
     """
     joint = (pairs + pairs.T) / 2
     total = jnp.sum(joint)
@@ -45,4 +42,4 @@ def region_agreement(pairs: Array) -> Array:
     joint = joint / jnp.sum(joint)
     alone = jnp.sum(joint, axis=0)
     together = jnp.sum(joint * jnp.log(joint))
-    return jnp.where(usable, together - (2 + _EVENNESS) * jnp.sum(alone * jnp.log(alone)), 0.0)
+    return jnp.where(usable, together - 2 * jnp.sum(alone * jnp.log(alone)), 0.0)

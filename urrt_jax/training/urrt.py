@@ -12,17 +12,15 @@ from urrt_jax.clouds import Cloud, first, shift
 from urrt_jax.features import moment_invariants
 from urrt_jax.frames import Frame, normalize_pair
 from urrt_jax.loops import each_cloud
-from urrt_jax.losses import chamfer, occupancy_loss, region_agreement, region_pairs, shell_samples
+from urrt_jax.losses import chamfer, occupancy_loss, shell_samples
 from urrt_jax.model import Model, ModelConfig, init_model
-from urrt_jax.model.network import Estimate, estimate_subsampled
-from urrt_jax.model.partition import branch_logits, inputs_at_places, inputs_of_parts, occupancy_logits, region_scores
-from urrt_jax.neighbors import nearest
+from urrt_jax.model.encoding import Encoding
+from urrt_jax.model.network import estimate_subsampled
+from urrt_jax.model.partition import branch_logits, inputs_at_places, inputs_of_parts, occupancy_logits
 from urrt_jax.rigid import Rigid
-from urrt_jax.training.pairs import Pair, add_noise
-from urrt_jax.training.trainable import PAIRS, Metrics, Trainable, Variables
-
-_SHARPNESS = 5.0  # of the scores that are to agree: fresh branches hardly differ, and would stay alike twice as long
-_NOISE = 0.03  # largest deviation of the noise of samples whose regions are to agree, in the network's frame
+from urrt_jax.training.pairs import Pair
+from urrt_jax.training.regions import agreement_of_samples, noisy_samples
+from urrt_jax.training.trainable import Metrics, Trainable, Variables
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,12 +77,8 @@ class URRT(Trainable):
         distances = alignment_losses(self, *whole, answer.steps)
         loss, metrics = jnp.mean(distances), {"chamfer": distances[-1], "chamfer_first": distances[0]}
         if self.model.has_regions:
-            occupancy, found = occupancy_of_target(self, model, pair, frame, whole[1], answer, key)
-            loss, metrics = loss + self.occupancy_weight * occupancy, metrics | found
-            if self.model.partition == "parts":
-                agreement = agreement_of_samples(self, model, whole[1], jax.random.fold_in(key, 1))
-                loss = loss - self.occupancy_weight * self.agreement_weight * agreement
-                metrics |= {"agreement": agreement}
+            taught, found = partition_loss(self, model, pair, frame, whole[1], answer.target, key)
+            loss, metrics = loss + self.occupancy_weight * taught, metrics | found
         return loss, metrics, {}
 
     def evaluate(self, variables: Variables, pair: Pair, key: Array) -> tuple[Array, Rigid]:
@@ -127,57 +121,45 @@ def alignment_losses(method: URRT, source: Cloud, target: Cloud, steps: Rigid) -
     return jax.vmap(aligned)(steps)
 
 
-def occupancy_of_target(
-    method: URRT, model: Model, pair: Pair, frame: Frame, whole: Cloud, answer: Estimate, key: Array
+def partition_loss(
+    method: URRT, model: Model, pair: Pair, frame: Frame, whole: Cloud, target: Encoding, key: Array
 ) -> tuple[Array, Metrics]:
-    """The loss of occupancy, asked of the target, (), and what is worth a line in the log.
+    """The loss that teaches the partition, (), and what is worth a line in the log.
 
-    Where the pair has no queries, they are drawn about the ``whole`` target.
+    Places are asked about: whether they lie inside. Branches by place answer for the target as the network sees it,
+    because they see its embedding. Branches of parts answer for a sample of the ``whole`` target, in the network's
+    frame; besides, two samples are to be cut alike, which pays by ``method.agreement_weight``.
     """
-    if pair.queries is None or pair.inside is None:
-        queries, inside = shell_samples(key, first(whole, method.loss_points), method.occupancy_queries)
+    config, agreement = model.config, jnp.zeros(())
+    asked, drawn = jax.random.split(key)
+    if config.partition == "places":
+        cloud, condition = target.cloud, target.condition
     else:
-        rows = jax.random.choice(key, pair.queries.shape[0], (method.occupancy_queries,))
-        queries, inside = (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
-    inputs = inputs_at_places(model.config, answer.target.cloud, queries, answer.target.condition)
-    logits = occupancy_logits(branch_logits(model.config, model.params["partition"], inputs))
-    counts = answer.target.regions.counts
-    loss = occupancy_loss(logits, inside)
-    return loss, {
-        "occupancy": loss,
+        samples = noisy_samples(drawn, whole, config.points)
+        describe = lambda cloud: inputs_of_parts(config, cloud, moment_invariants(cloud, config.octaves))  # noqa: E731
+        inputs = each_cloud(describe, *samples)
+        cloud, condition = samples[0], inputs[0].condition
+        agreement = agreement_of_samples(model, samples, inputs, method.chamfer_scale)
+    places, inside = places_about(method, pair, frame, whole, asked)
+    inputs = inputs_at_places(config, cloud, places, condition)
+    logits = occupancy_logits(branch_logits(config, model.params["partition"], inputs))
+    occupancy, counts = occupancy_loss(logits, inside), target.regions.counts
+    metrics = {
+        "occupancy": occupancy,
         "occupancy_accuracy": jnp.mean((logits > 0) == inside),
         "regions_used": jnp.sum(counts > 0.01 * jnp.sum(counts)).astype(jnp.float32),
     }
+    if config.partition == "parts":
+        metrics |= {"agreement": agreement}
+    return occupancy - method.agreement_weight * agreement, metrics
 
 
-def agreement_of_samples(method: URRT, model: Model, cloud: Cloud, key: Array) -> Array:
-    """How well the regions of two noisy samples agree (``region_agreement``), (): the mean of this cloud and its batch.
+def places_about(method: URRT, pair: Pair, frame: Frame, whole: Cloud, key: Array) -> tuple[Array, Array]:
+    """Places (Q, 3) about the whole target, in the network's frame, and whether they lie inside, (Q,) bool.
 
-    Points of two random halves of the cloud correspond that are neighbours. Each half has noise of its own. Both are in
-    one pose, so that none needs to be known. The batch is that of the ``vmap`` whose axis is ``PAIRS``.
-
-    Args:
-      method: what is trained.
-      model: the network.
-      cloud: N points, in the network's frame, from which the samples are drawn.
-      key: random key.
+    Those that come with the pair, else they are drawn about the cloud, inside being near to it.
     """
-    order, level, *noises = jax.random.split(key, 4)
-    rows = jax.random.permutation(order, cloud.mask.shape[0])
-    count = min(model.config.points, cloud.mask.shape[0] // 2)
-    sigma = jax.random.uniform(level, maxval=_NOISE)
-    one, other = (
-        add_noise(noise, jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], cloud), sigma)
-        for noise, chosen in zip(noises, (rows[:count], rows[-count:]), strict=True)
-    )
-    here, there = each_cloud(lambda sample: _sample_scores(model, sample), one, other)
-    found = nearest(one.points, other)
-    weights = jnp.where(one.mask, jnp.exp(-found.squared / method.chamfer_scale**2), 0.0)
-    pairs = region_pairs(here, there[found.index], weights)
-    return (region_agreement(pairs) + region_agreement(jax.lax.pmean(pairs, PAIRS))) / 2
-
-
-def _sample_scores(model: Model, cloud: Cloud) -> Array:
-    """The sharpened scores (N, n) of the regions of a cloud whose branches see surroundings."""
-    inputs = inputs_of_parts(model.config, cloud, moment_invariants(cloud, model.config.octaves))
-    return region_scores(_SHARPNESS * branch_logits(model.config, model.params["partition"], inputs))
+    if pair.queries is None or pair.inside is None:
+        return shell_samples(key, first(whole, method.loss_points), method.occupancy_queries)
+    rows = jax.random.choice(key, pair.queries.shape[0], (method.occupancy_queries,))
+    return (pair.queries[rows] - frame.target_center) / frame.scale, pair.inside[rows]
