@@ -161,7 +161,7 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
         cells = []
         for protocol in PROTOCOLS:
             means = np.array([np.mean(row["angles"][protocol]) for row in some])
-            cells.append(f"{means.mean():.2f}° ± {means.std(ddof=1) if len(means) > 1 else 0:.2f}")
+            cells.append(f"{means.mean():.2f}°" + (f" ± {means.std(ddof=1):.2f}" if len(means) > 1 else ""))
         bases = grouped[BASES[name]]
         if name == BASES[name] or not bases:
             cells.append("1" if bases else "–")

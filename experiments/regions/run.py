@@ -1,12 +1,13 @@
 """Whether regions mean something: how many are used, how evenly, and whether both clouds of a pair are cut alike.
 
-    python experiments/regions/run.py --data PATH
+    python experiments/regions/run.py --data PATH [--model FILE.npz]
 
-Test shapes. Consistency is the share of points whose counterpart in the other cloud has the same region: before
-anything is aligned, on four protocols, and in the last step of the network on clean pairs. A point's counterpart is the
-nearest one under the true pose, if it lies within 0.1. Occupancy accuracy is the share of places about the clean target
-that the branches call inside or outside rightly. Writes results.json, table.md and regions.png beside this file; with
---model it measures another network and prints only.
+There are two networks: the packaged one, whose regions are by place, and the one in parts.npz beside this file, whose
+regions are parts. Pairs are of test shapes. Consistency is the share of points whose counterpart in the other cloud has
+the same region: before anything is aligned, on four protocols, and in the last step of the network on clean pairs. A
+point's counterpart is the nearest one under the true pose, if it lies within 0.1. Occupancy accuracy is the share of
+places about the clean target that the branches call inside or outside rightly. Writes results.json, table.md,
+places.png and parts.png beside this file; with --model it measures another network and prints only.
 """
 
 import argparse
@@ -38,6 +39,7 @@ from urrt_jax.weights import DEFAULT
 HERE = Path(__file__).parent
 STRIDE, BATCH, QUERIES = 4, 64, 256
 NEAR = 0.1  # in units of the shape's bounding sphere
+NETWORKS = {"places": DEFAULT, "parts": HERE / "parts.npz"}
 PROTOCOLS = {
     "dcp": "clean",
     "drift": "P.D.",
@@ -170,29 +172,36 @@ def draw(found: Cut, sources: np.ndarray, targets: np.ndarray, rows: dict[str, i
     plt.close(figure)
 
 
-def as_markdown(results: dict) -> str:
-    lines = ["| test pairs | |", "|---|---:|"]
-    return "\n".join(lines + [f"| {name} | {value:g} |" for name, value in results["numbers"].items()]) + "\n"
+def as_markdown(networks: dict[str, dict[str, float]]) -> str:
+    """The numbers of each network, side by side."""
+    lines = [f"| test pairs | {' | '.join(networks)} |", "|---|" + "---:|" * len(networks)]
+    names = next(iter(networks.values()))
+    rows = [[name, *(f"{numbers[name]:g}" for numbers in networks.values())] for name in names]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)]) + "\n"
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", required=True, help="ModelNet40 as 'urrt train' takes it")
-    parser.add_argument("--model", help="a .npz file of 'urrt train', measured instead of the packaged weights")
+    parser.add_argument("--model", help="a .npz file of 'urrt train', measured instead of the two networks")
     flags = parser.parse_args()
     shapes = load_shapes(flags.data, split="test", points=1024)
-    names = np.asarray(shapes.classes)[shapes.labels][::STRIDE]
-    numbers, found, sources, targets = measure(load_model(flags.model or DEFAULT), shapes.points)
     if flags.model:
-        print(as_markdown({"numbers": numbers}))
+        print(as_markdown({Path(flags.model).stem: measure(load_model(flags.model), shapes.points)[0]}))
         sys.exit()
+    names = np.asarray(shapes.classes)[shapes.labels][::STRIDE]
+    shown = {name: int(np.flatnonzero(names == name)[0]) for name in SHOWN}
+    networks, cards = {}, {name: model_card(source) for name, source in NETWORKS.items()}
+    for name, source in NETWORKS.items():
+        networks[name], found, sources, targets = measure(load_model(source), shapes.points)
+        draw(found, sources, targets, shown, HERE / f"{name}.png")
     results = {
         "command": f"python experiments/regions/run.py --data {Path(flags.data).name}",
-        "model_sha256": model_card()["sha256"],
+        "model_sha256": cards["places"]["sha256"],
+        "parts_sha256": cards["parts"]["sha256"],
         "jax": jax.__version__,
-        "numbers": numbers,
+        "numbers": networks,
     }
     (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    (HERE / "table.md").write_text(as_markdown(results))
-    draw(found, sources, targets, {name: int(np.flatnonzero(names == name)[0]) for name in SHOWN}, HERE / "regions.png")
-    print(as_markdown(results))
+    (HERE / "table.md").write_text(as_markdown(networks))
+    print(as_markdown(networks))
