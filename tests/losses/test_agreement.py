@@ -27,7 +27,9 @@ def test_regions_that_know_nothing_of_each_other_have_none():
 
 
 def test_uneven_regions_that_agree_have_less():
-    uneven = jnp.diag(jnp.array([0.7, 0.1, 0.1, 0.1]))
+    shares = np.array([0.7, 0.1, 0.1, 0.1])
+    uneven = jnp.diag(jnp.asarray(shares))
+    assert float(region_agreement(uneven)) == pytest.approx(-np.sum(shares * np.log(shares)), abs=1e-4)
     assert float(region_agreement(uneven)) < float(region_agreement(jnp.eye(4))) - 0.4
 
 

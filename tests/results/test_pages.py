@@ -205,7 +205,7 @@ RESULTS = (
     f"of clean pairs {_same('clean')} % have the same region before anything is aligned, of independent samples with "
     f"noise {_same('independent + noise')} %",
     f"of pairs that are both cropped it is {_same('D.I. two-sided')} %",
-    f"trained for {_PARTS_CARD['seconds'] / 60:.0f} minutes from the packaged ones",
+    f"trained for {_PARTS_CARD['seconds'] / 60:.0f} minutes from the packaged ones: `{_PARTS_CARD['command']}`",
     f"by at most {max(_gains_in_the_grid().values()):.3f}",
     f"{len(load('trials')['rows'])} changes of the network",
 )

@@ -130,28 +130,26 @@ def partition_loss(
     because they see its embedding. Branches of parts answer for a sample of the ``whole`` target, in the network's
     frame; besides, two samples are to be cut alike, which pays by ``method.agreement_weight``.
     """
-    config, agreement = model.config, jnp.zeros(())
+    config = model.config
     asked, drawn = jax.random.split(key)
     if config.partition == "places":
-        cloud, condition = target.cloud, target.condition
+        cloud, condition, told = target.cloud, target.condition, {}
     else:
         samples = noisy_samples(drawn, whole, config.points)
         describe = lambda cloud: inputs_of_parts(config, cloud, moment_invariants(cloud, config.octaves))  # noqa: E731
-        inputs = each_cloud(describe, *samples)
-        cloud, condition = samples[0], inputs[0].condition
-        agreement = agreement_of_samples(model, samples, inputs, method.chamfer_scale)
+        both = each_cloud(describe, *samples)
+        cloud, condition = samples[0], both[0].condition
+        told = {"agreement": agreement_of_samples(model, samples, both, method.chamfer_scale)}
     places, inside = places_about(method, pair, frame, whole, asked)
     inputs = inputs_at_places(config, cloud, places, condition)
     logits = occupancy_logits(branch_logits(config, model.params["partition"], inputs))
     occupancy, counts = occupancy_loss(logits, inside), target.regions.counts
-    metrics = {
+    told |= {
         "occupancy": occupancy,
         "occupancy_accuracy": jnp.mean((logits > 0) == inside),
         "regions_used": jnp.sum(counts > 0.01 * jnp.sum(counts)).astype(jnp.float32),
     }
-    if config.partition == "parts":
-        metrics |= {"agreement": agreement}
-    return occupancy - method.agreement_weight * agreement, metrics
+    return occupancy - method.agreement_weight * told.get("agreement", 0.0), told
 
 
 def places_about(method: URRT, pair: Pair, frame: Frame, whole: Cloud, key: Array) -> tuple[Array, Array]:
