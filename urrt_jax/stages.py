@@ -73,9 +73,10 @@ STEPS_BEFORE_REFINEMENT = 2
 """Steps of the network, at most, where refinement follows, which does the rest."""
 _SMALLEST_RUNG, _FACTOR = 256, 4
 _SAMPLE = 512  # points of the even subsample, at least
-# The score of the plain pose on the subsample (``Fit.score``) below which a search is called for. Dense clouds are
-# searched more readily, because their quick look is cheap and seldom wrong. Chosen on training shapes and bunny pairs.
-_FITS, _FITS_DENSE = 0.80, 0.87
+# What the plain pose is worth on the subsample (``Fit.score`` less what its turn costs), below which a search is called
+# for. Dense clouds are searched more readily, because their quick look is cheap and seldom wrong. Chosen on training
+# shapes and bunny pairs.
+_FITS, _FITS_DENSE = 0.78, 0.87
 _COARSE_GRID, _LOST_GRID = 0.1, 1.0
 """The step between float32 coordinates, in spacings, from which on lost digits explain a failure, and from which on no
 result is trusted: then neighbouring points have fallen together. Guesses."""
@@ -229,7 +230,7 @@ def estimate(model: Model, source: Samples, target: Samples, known: Known, told:
 
 @Program
 def approach(
-    options: tuple[ICP, Array | bool],
+    options: tuple[ICP, Array | bool, Array | float],
     source: Samples,
     target: Samples,
     counts: tuple[Array, Array],
@@ -238,17 +239,23 @@ def approach(
 ) -> Plan:
     """The plain pose, refined on even samples, and what it calls for.
 
+    A search, where the samples do not fit, or do not fit well enough for how far it turns: what a turn costs in the
+    search (the preference, the last of the options) counts here, too. On nearly symmetric shapes such a pose is often
+    the wrong way around.
+
     Where the pose is known there is nothing to refine here or to search for: on a plane, whose samples slide, other
     poses may well fit better.
     """
-    how, always = options
+    how, always, preference = options
     kept = known.transform, jnp.zeros_like(known.transform.translation[0])
     found = jax.lax.cond(anyone(~known.sure), lambda: find_basin(how, source, target, start), lambda: kept)
     transform, width = rigid.choose(known.sure, kept[0], found[0]), jnp.where(known.sure, kept[1], found[1])
     glance = fit_samples(source.even, target.even, transform, prepared.coarser(source, target))
     fewer = jnp.minimum(*counts)
     dense = fewer >= search.DENSE
-    pending = ~known.sure & (always | (glance.score < jnp.where(dense, _FITS_DENSE, _FITS)))
+    turn = rigid.rotation_angle(transform.rotation, jnp.eye(3)) / np.pi
+    worth = glance.score - search.cost(search.preference_among(preference, dense), turn)
+    pending = ~known.sure & (always | (worth < jnp.where(dense, _FITS_DENSE, _FITS)))
     return Plan(Found(transform, jnp.zeros_like(width), width, pending), pending & dense, fewer > THINNED)
 
 
@@ -395,7 +402,9 @@ def register_in_frame(
     pose, settled, steps = start.transform, told.initial_is_finite, np.int32(0)
     if refined:
         counts = clouds[0].count, clouds[1].count
-        found, quick, thin_first = call(approach, (refiner, always), *samples, counts, known, start.transform)
+        preference = 0.0 if searching is None else searching.preference
+        asked = refiner, always, preference
+        found, quick, thin_first = call(approach, asked, *samples, counts, known, start.transform)
         if searching is not None:
             found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)

@@ -100,9 +100,15 @@ def speed(name: str, shapes: Shapes) -> float:
 
 
 def begin(path: Path, settings: dict[str, Any], shapes: Shapes) -> dict[str, Any]:
-    """What the results file holds, or, where it is of other settings, one without rows, and with speeds measured."""
-    results = json.loads(path.read_text()) if path.exists() else {}
-    if results.get("settings") == settings:
+    """What the results file holds; where there is none, one without rows, for which speeds are measured.
+
+    Raises:
+      ValueError: the results are of other settings. They took hours, so they are not overwritten.
+    """
+    if path.exists():
+        results = json.loads(path.read_text())
+        if results["settings"] != settings:
+            raise ValueError(f"{path.name}: holds results of {results['settings']}, not of {settings}; move it away first")
         return results
     speeds = {name: round(speed(name, shapes), 3) for name in tqdm(MODELS, desc="speeds", unit="model")}
     command = f"python experiments/ablation/equal_time.py --data {settings['data']} --minutes {settings['minutes']:g}"
@@ -193,7 +199,10 @@ if __name__ == "__main__":
     test = dict.fromkeys(PROTOCOLS, load_shapes(flags.data, split="test", points=1024).points[::STRIDE])
     test["rpmnet"] = load_shapes(str(Path(flags.data) / RPMNET), split="test", points=2048).points
     path, settings = HERE / "equal_time.json", {"data": Path(flags.data).name, "minutes": flags.minutes}
-    results = begin(path, settings, shapes)
+    try:
+        results = begin(path, settings, shapes)
+    except ValueError as error:
+        parser.error(str(error))
     there = {(row["model"], row["seed"]) for row in results["rows"]}
     todo = [(name, seed) for seed in flags.seeds for name in flags.only if (name, seed) not in there]
     for name, seed in tqdm(todo, desc="models", unit="run"):

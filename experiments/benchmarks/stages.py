@@ -103,7 +103,7 @@ def measure(data: str) -> dict:
     known = recognise.batched(None, *figures)
     unknown = known._replace(sure=jnp.zeros_like(known.sure))
     start = estimate.batched(model, *samples, unknown, told)
-    looked = (refine, False), *samples, (ready[0].count, ready[1].count), unknown, start.transform
+    looked = (refine, False, 0.0), *samples, (ready[0].count, ready[1].count), unknown, start.transform
     found = approach.batched(*looked).found
     settled = settle.batched(refine, *ready, found.transform, found.width)
     last = expect.batched(refine, *ready, settled)

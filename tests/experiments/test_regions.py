@@ -11,7 +11,7 @@ def regions(load_script):
 
 def _cut(regions, source, target, counterpart, near):
     source, target, counterpart = (np.array([each]) for each in (source, target, counterpart))
-    return regions.Cut(source, source, target, counterpart, np.array([near]), np.array([[True]]))
+    return regions.Cut(source, source, target, counterpart, np.array([near]), np.array([[True]]), np.zeros(1))
 
 
 def test_consistency_is_of_points_that_have_a_counterpart(regions):
@@ -28,6 +28,8 @@ def test_parts_of_the_same_points_are_the_same_before_anything_is_aligned(region
     numbers, found, sources, targets = regions.measure(parts_model, np.tile(points, (1, 6, 1))[:, :1024], 1)
     assert numbers["consistency before alignment, clean"] > 0.99
     assert numbers["consistency before alignment, D.I. two-sided"] < 1
+    assert numbers["degrees off by the regions' centroids, clean, mean"] < 0.1
+    assert numbers["degrees off by the regions' centroids, D.I. two-sided, mean"] > 1
     assert numbers["pairs"] == len(sources) == len(targets) == len(found.source) == 2
     table = regions.as_markdown({"places": numbers, "parts": numbers})
     assert table.count("\n") == 2 + len(numbers) and table.startswith("| test pairs | places | parts |")

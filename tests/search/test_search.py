@@ -298,15 +298,28 @@ def test_a_quick_look_at_another_shape_is_not_sure(look, cloud):
 def test_only_dense_clouds_are_looked_at_quickly(cloud, make_cloud_points, counts, quick):
     samples = _samples(_pad(cloud), _pad(make_cloud_points(1)))
     unknown = Known(rigid.identity(), np.bool_(False))
-    plan = stages.approach((ICP(), True), *samples, tuple(map(np.int32, counts)), unknown, rigid.identity())
+    plan = stages.approach((ICP(), True, 0.0), *samples, tuple(map(np.int32, counts)), unknown, rigid.identity())
     assert bool(plan.quick) == quick
     assert plan.found.pending
+
+
+@pytest.mark.parametrize(
+    ("degrees", "preference", "pending"), [(170, 0.0, False), (170, 0.3, True), (20, 0.3, False), (170, 0.03, False)]
+)
+def test_a_pose_that_fits_is_searched_only_where_its_turn_costs_much(cloud, degrees, preference, pending):
+    turn = _turn(degrees)
+    samples = _samples(_pad(cloud), _pad((cloud @ turn.T).astype(np.float32)))
+    counts, unknown = (np.int32(len(cloud)),) * 2, Known(rigid.identity(), np.bool_(False))
+    start = rigid.Rigid(np.float32(turn), np.zeros(3, np.float32))
+    plan = stages.approach((ICP(), False, preference), *samples, counts, unknown, start)
+    assert bool(plan.found.pending) == pending
+    assert _degrees(plan.found.transform.rotation, turn) < 1
 
 
 def test_clouds_of_the_same_points_are_not_searched(partial):
     samples = _samples(*(_pad(cloud) for cloud in partial(120)))
     known = stages.recognise(None, *(each.constellations for each in samples))
-    plan = stages.approach((ICP(), True), *samples, (np.int32(DENSE),) * 2, known, rigid.identity())
+    plan = stages.approach((ICP(), True, 0.0), *samples, (np.int32(DENSE),) * 2, known, rigid.identity())
     assert not plan.found.pending and not plan.quick
     assert _degrees(plan.found.transform.rotation, _turn(120)) < 0.01
 

@@ -5,13 +5,15 @@ Where both clouds hold the same points, ``find_counterparts`` finds the pose wit
 
 from urrt_jax.search.config import Search
 from urrt_jax.search.counterparts import find_counterparts
-from urrt_jax.search.search import DENSE, Found, search_quickly, search_thoroughly
+from urrt_jax.search.search import DENSE, Found, cost, preference_among, search_quickly, search_thoroughly
 
 __all__ = [
     "DENSE",
     "Found",
     "Search",
+    "cost",
     "find_counterparts",
+    "preference_among",
     "search_quickly",
     "search_thoroughly",
 ]

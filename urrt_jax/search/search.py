@@ -132,13 +132,23 @@ def _best(poses: Rigid, scores: Array, count: int, search: Search) -> tuple[Rigi
     turn = rigid.rotation_angle(poses.rotation, jnp.eye(3)) / jnp.deg2rad(search.max_angle)
     allowed = turn <= 1 + 1e-4
     # With what turns cost, allowed poses are worth -preference at least.
-    worth = jnp.where(allowed, scores - search.preference * turn**2, -1.0 - search.preference)
+    worth = jnp.where(allowed, scores - cost(search.preference, turn), -1.0 - search.preference)
     _, rows = jax.lax.top_k(worth, min(count, len(worth)))
     return jax.tree.map(lambda leaf: leaf[rows], poses), jnp.where(allowed, scores, -1.0)[rows]
 
 
+def cost(preference: Array | float, turn: Array) -> Array:
+    """What a pose that turns costs, (), in score. ``turn`` is its share of the largest angle (``Search.preference``)."""
+    return preference * turn**2
+
+
+def preference_among(preference: Array | float, dense: Array) -> Array:
+    """The preference, (), for poses that turn less: smaller among ``dense`` clouds."""
+    return preference * jnp.where(dense, _CHEAPER, 1.0)
+
+
 def _cheaper(search: Search, dense: Array) -> Search:
-    return dataclasses.replace(search, preference=search.preference * jnp.where(dense, _CHEAPER, 1.0))
+    return dataclasses.replace(search, preference=preference_among(search.preference, dense))
 
 
 def _from_features(
