@@ -13,9 +13,10 @@ A registration takes these steps. Each one after the first is a *stage*: a progr
 4. **Estimate** (``estimate``). The network (``urrt_jax.model``) estimates the transform from the samples. The user's
    initial transform takes its place where it fits better.
 5. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. It calls for a search
-   where the samples do not fit in it.
-6. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``; rare). Matched FPFH features and the
-   network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Nothing is random.
+   where the samples do not fit in it, or not well enough for how far it turns.
+6. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``, ``verify``; rare). Matched FPFH features and
+   the network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Of dense clouds
+   three finalists go through the next stage, and the one in which the clouds then fit best is kept. Nothing is random.
 7. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
    directions, among the full clouds, mostly point to plane. The bandwidth of its weights shrinks to the spacing, and
    then to the spread of the distances themselves, so that points without a counterpart do not pull. Small clouds whose
@@ -34,6 +35,7 @@ whatever the clouds. ``prepare``, ``settle``, ``assess`` and ``label`` see whole
 of the ladder, as are the rare ``settle_thinned`` and ``expect`` where a pair needs them.
 """
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -248,15 +250,17 @@ def approach(
     """
     how, always, preference = options
     kept = known.transform, jnp.zeros_like(known.transform.translation[0])
-    found = jax.lax.cond(anyone(~known.sure), lambda: find_basin(how, source, target, start), lambda: kept)
-    transform, width = rigid.choose(known.sure, kept[0], found[0]), jnp.where(known.sure, kept[1], found[1])
+    basin = jax.lax.cond(anyone(~known.sure), lambda: find_basin(how, source, target, start), lambda: kept)
+    transform, width = rigid.choose(known.sure, kept[0], basin[0]), jnp.where(known.sure, kept[1], basin[1])
     glance = fit_samples(source.even, target.even, transform, prepared.coarser(source, target))
     fewer = jnp.minimum(*counts)
     dense = fewer >= search.DENSE
     turn = rigid.rotation_angle(transform.rotation, jnp.eye(3)) / np.pi
     worth = glance.score - search.cost(search.preference_among(preference, dense), turn)
     pending = ~known.sure & (always | (worth < jnp.where(dense, _FITS_DENSE, _FITS)))
-    return Plan(Found(transform, jnp.zeros_like(width), width, pending), pending & dense, fewer > THINNED)
+    finalists = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (search.FINALISTS, *leaf.shape)), transform)
+    found = Found(transform, jnp.zeros_like(width), width, pending, finalists)
+    return Plan(found, pending & dense, fewer > THINNED)
 
 
 @Program
@@ -340,6 +344,7 @@ def label(_: None, cloud: Prepared, seen: Seen) -> Array:
 prepare = Program(prepared.prepare)
 search_quickly = Program(search.search_quickly)
 search_thoroughly = Program(search.search_thoroughly)
+verify = Program(search.verify)
 settle_thinned = Program(refine.settle_thinned)
 settle = Program(refine.settle)
 expect = Program(refine.expect)
@@ -378,7 +383,7 @@ def register_in_frame(
             return size >= least
         return size >= least and (most is None or size <= rung(most)) and (rare or often)
 
-    def when(needed: Any, program: Program, arguments: tuple, otherwise: Any, *, least: int = 0) -> Any:
+    def when(needed: Any, program: Callable, arguments: tuple, otherwise: Any, *, least: int = 0) -> Any:
         """The program's answer for the pairs that need it."""
         if not wanted(needed, least=least):
             return otherwise
@@ -408,6 +413,8 @@ def register_in_frame(
         if searching is not None:
             found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
+            if how is not None:
+                found = when(found.pending, _verified, (how, *clouds, found), found, least=search.DENSE)
             pose = found.transform
     if how is not None:
         pose, width = found.transform, found.width
@@ -429,6 +436,28 @@ def register_in_frame(
         target_regions=call(label, None, clouds[1], start.target),
         steps=steps,
     )
+
+
+def _verified(refiner: ICP, source: Prepared, target: Prepared, found: Found) -> Found:
+    """The finalist in which dense clouds fit best, once all have been refined: a stage of other stages."""
+
+    def refined(pose: Rigid) -> Rigid:
+        width = found.width
+        if source.cloud.mask.shape[-1] > THINNED:
+            pose, width = settle_thinned(refiner, source, target, pose, width)
+        return settle(refiner, source, target, pose, width).transform
+
+    mode = _mode(source, target, found)
+    if mode == "traced":
+        ends = jax.lax.map(refined, found.finalists)
+    elif mode == "abstract":
+        refined(found.transform)
+        ends = found.finalists
+    else:
+        rows = range(search.FINALISTS)
+        each = [refined(jax.tree.map(lambda leaf, row=row: leaf[row], found.finalists)) for row in rows]
+        ends = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+    return verify(None, source.samples, target.samples, found, ends)
 
 
 def _not_known(cloud: Cloud) -> Known:
@@ -458,7 +487,7 @@ def _mode(*arguments: Any) -> Literal["traced", "abstract", "concrete"]:
     return "abstract" if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves) else "concrete"
 
 
-def _one_by_one(needed: np.ndarray, program: Program, arguments: tuple, otherwise: Any) -> Any:
+def _one_by_one(needed: np.ndarray, program: Callable, arguments: tuple, otherwise: Any) -> Any:
     """The program's answers for the pairs of a batch (B,) that need it, the first argument shared by all."""
     shared, *each = arguments
     host, answers = jax.tree.map(np.asarray, each), jax.tree.map(np.array, otherwise)

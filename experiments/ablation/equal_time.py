@@ -108,7 +108,9 @@ def begin(path: Path, settings: dict[str, Any], shapes: Shapes) -> dict[str, Any
     if path.exists():
         results = json.loads(path.read_text())
         if results["settings"] != settings:
-            raise ValueError(f"{path.name}: holds results of {results['settings']}, not of {settings}; move it away first")
+            raise ValueError(
+                f"{path.name}: holds results of {results['settings']}, not of {settings}; move it away first"
+            )
         return results
     speeds = {name: round(speed(name, shapes), 3) for name in tqdm(MODELS, desc="speeds", unit="model")}
     command = f"python experiments/ablation/equal_time.py --data {settings['data']} --minutes {settings['minutes']:g}"

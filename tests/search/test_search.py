@@ -20,7 +20,7 @@ from urrt_jax.prepared import Sizes, coarser
 from urrt_jax.refine import ICP
 from urrt_jax.rigid import Known
 from urrt_jax.search import Found, Search
-from urrt_jax.search.search import DENSE, search_thoroughly
+from urrt_jax.search.search import DENSE, FINALISTS, _finalists, search_thoroughly
 
 _SMALL = Search(points=128, matches=16, landmarks=0, tried=16)
 _SIZE = 256
@@ -58,7 +58,9 @@ def _samples(source, target):
 
 def _plain(transform: rigid.Rigid | None = None) -> Found:
     """The pose that a search begins with, by default the identity."""
-    return Found(transform or rigid.identity(), jnp.zeros(()), jnp.zeros(()), jnp.array(True))
+    transform = transform or rigid.identity()
+    finalists = jax.tree.map(lambda leaf: jnp.stack([leaf] * FINALISTS), transform)
+    return Found(transform, jnp.zeros(()), jnp.zeros(()), jnp.array(True), finalists)
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +277,16 @@ def test_of_poses_that_fit_nearly_alike_the_one_that_turns_less_is_preferred(fin
     found = find(source, (source @ turn.T).astype(np.float32), config, plain)
     assert _degrees(found.transform.rotation, np.eye(3)) == pytest.approx(expected, abs=4)
     assert float(found.score) > 0.9  # what a turn costs is not taken from it
+
+
+def test_finalists_are_the_best_poses_that_are_far_from_each_other():
+    angles, scores = [10.0, 12.0, 100.0, 95.0, 60.0, 170.0], jnp.array([0.9, 0.8, 0.5, 0.7, 0.1, 0.6])
+    turns = np.stack([_turn(angle) for angle in angles]).astype(np.float32)
+    poses = rigid.Rigid(jnp.asarray(turns), jnp.zeros((6, 3)))
+    found = jax.tree.map(lambda leaf: leaf[0], poses)
+    np.testing.assert_array_equal(_finalists(found, poses, scores).rotation, turns[[0, 3, 5]])
+    alike = jax.tree.map(lambda leaf: leaf[:2], poses)
+    np.testing.assert_array_equal(_finalists(found, alike, scores[:2]).rotation, turns[[0, 0, 0]])
 
 
 @pytest.mark.parametrize("degrees", [0, 60, 120, 180])

@@ -5,10 +5,20 @@ Where both clouds hold the same points, ``find_counterparts`` finds the pose wit
 
 from urrt_jax.search.config import Search
 from urrt_jax.search.counterparts import find_counterparts
-from urrt_jax.search.search import DENSE, Found, cost, preference_among, search_quickly, search_thoroughly
+from urrt_jax.search.search import (
+    DENSE,
+    FINALISTS,
+    Found,
+    cost,
+    preference_among,
+    search_quickly,
+    search_thoroughly,
+    verify,
+)
 
 __all__ = [
     "DENSE",
+    "FINALISTS",
     "Found",
     "Search",
     "cost",
@@ -16,4 +26,5 @@ __all__ = [
     "preference_among",
     "search_quickly",
     "search_thoroughly",
+    "verify",
 ]

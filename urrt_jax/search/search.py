@@ -35,6 +35,9 @@ _QUICK_MATCHES, _QUICK_TRIED = 32, 16  # hypotheses of the quick look, and those
 _ALIKE = 5.0  # degrees between poses that are the same
 _CHEAPER = 0.1  # what turns cost dense clouds, which tell nearly symmetric poses apart better than sparse ones do
 _UNANIMOUSLY = 0.5  # of the confidence that settles it, where most of the hypotheses that were kept end in one pose
+_APART = 20.0  # degrees between finalists
+FINALISTS = 3
+"""Poses that are compared among whole clouds."""
 DENSE = 4096
 """Points of each cloud from which on a quick look is taken first: eight times the 512 of the sample that it sees."""
 
@@ -46,13 +49,15 @@ class Found(NamedTuple):
       transform: source to target; no derivative passes.
       score: (), in [0, 1]: how well the subsamples' surfaces lie on each other (``Fit.score``).
       width: (), the distance within which the transform can be trusted: the subsample's spacing.
-      pending: (), bool, whether a more thorough search is called for.
+      pending: (), bool, whether more is called for: a search, a more thorough one, and at last ``verify``.
+      finalists: stacked, this pose and the next best ones, each far from those before it; it again where there is none.
     """
 
     transform: Rigid
     score: Array
     width: Array
     pending: Array
+    finalists: Rigid
 
 
 def search_quickly(search: Search, source: Samples, target: Samples, plain: Found) -> Found:
@@ -80,7 +85,8 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
 
     They are told apart by how well the subsamples lie on each other in both directions: the best ``tried`` of them as
     they are, the best ``kept`` of these after a brief refinement on few points, the best one after a full one. Where
-    none turns by less than the largest angle, it is ``plain``, with a score of 0.
+    none turns by less than the largest angle, it is ``plain``, with a score of 0. Of dense clouds it is still to be
+    verified.
 
     Arguments as for ``search_quickly``, and the network that proposes hypotheses from its landmarks.
     """
@@ -95,7 +101,29 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     if search.landmarks:
         seen = first(source.even, model.config.points), first(target.even, model.config.points)
         guesses.append(propose(model, *seen, search.landmarks))
-    return _choose(guesses, few, width, plain.transform, search, search.tried)[0]
+    found, _ = _choose(guesses, few, width, plain.transform, search, search.tried)
+    return found._replace(pending=dense)
+
+
+def verify(_: None, source: Samples, target: Samples, found: Found, refined: Rigid) -> Found:
+    """Of the finalists of dense clouds, all refined, the one in which these fit best.
+
+    Where little overlaps, the few points of a search hardly tell surfaces that cross from surfaces that lie on each
+    other. Here as many as there are samples tell them apart.
+
+    Args:
+      _: shared by the pairs of a batch; here it is nothing.
+      source: samples of the source, in units of the clouds' radius.
+      target: samples of the target.
+      found: what a search has found.
+      refined: where refinement of its finalists ends, stacked.
+    """
+    source, target, found, refined = jax.lax.stop_gradient((source, target, found, refined))
+    clouds = source.thinned, target.thinned
+    width = coarser_spacing(*clouds)
+    scores = jax.lax.map(lambda pose: fit_samples(*clouds, pose, width).score, refined)  # compiled once
+    best = jnp.argmax(scores)
+    return found._replace(transform=jax.tree.map(lambda leaf: leaf[best], refined), pending=jnp.array(False))
 
 
 def _choose(
@@ -124,7 +152,23 @@ def _choose(
     found = jax.tree.map(lambda leaf, given: jnp.where(best[0] >= 0, leaf[0], given), poses, plain)
     alike = rigid.rotation_angle(full.rotation[2:], found.rotation) < jnp.deg2rad(_ALIKE)
     unanimous = jnp.sum(alike) > 0.5 * alike.shape[0]
-    return Found(found, jnp.maximum(best[0], 0.0), width, jnp.array(False)), unanimous
+    finalists = _finalists(found, full, scores)
+    return Found(found, jnp.maximum(best[0], 0.0), width, jnp.array(False), finalists), unanimous
+
+
+def _finalists(found: Rigid, poses: Rigid, scores: Array) -> Rigid:
+    """The pose found and the best of H others, each far from those before it."""
+
+    def pick(left: tuple[Rigid, Array], _: None) -> tuple[tuple[Rigid, Array], Rigid]:
+        before, scores = left
+        alike = rigid.rotation_angle(poses.rotation, before.rotation) < jnp.deg2rad(_APART)
+        scores = jnp.where(alike, -jnp.inf, scores)
+        row = jnp.argmax(scores)
+        best = jax.tree.map(lambda leaf, given: jnp.where(scores[row] > -jnp.inf, leaf[row], given), poses, found)
+        return (best, scores), best
+
+    others = jax.lax.scan(pick, (found, scores), None, length=FINALISTS - 1)[1]
+    return jax.tree.map(lambda own, leaf: jnp.concatenate([own[None], leaf]), found, others)
 
 
 def _best(poses: Rigid, scores: Array, count: int, search: Search) -> tuple[Rigid, Array]:
@@ -138,7 +182,7 @@ def _best(poses: Rigid, scores: Array, count: int, search: Search) -> tuple[Rigi
 
 
 def cost(preference: Array | float, turn: Array) -> Array:
-    """What a pose that turns costs, (), in score. ``turn`` is its share of the largest angle (``Search.preference``)."""
+    """What a pose costs that turns by this share of the largest angle, (), in score (``Search.preference``)."""
     return preference * turn**2
 
 
