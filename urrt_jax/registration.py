@@ -71,8 +71,8 @@ def register(
         subsample of 512 points, does not fit; the farther it turns, the better it must fit. This check is cheap. A
         search takes about as long as the rest of the registration, and much longer where it must be compiled first.
         "auto" does nothing where ``refine`` is None. A ``Search`` always searches; None never does. Among poses that
-        fit about alike "auto" prefers the one that turns less: a symmetric shape is not turned around. Small clouds (4,096 points) that hold the same points are aligned
-        by these, and need no search.
+        fit about alike "auto" prefers the one that turns less: a symmetric shape is not turned around. Small clouds
+        (4,096 points) that hold the same points are aligned by these, and need no search.
       initial: (4, 4), a rough transform from source to target where one is known, as from odometry or a turntable: the
         network and the search begin with the source moved by it, and largest angles count from it. No derivative
         passes to it.

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from experiments.ablation import equal_time
 from experiments.summary import HERE, find_part, load
 from urrt_jax import load_model, model_card
 
@@ -203,6 +204,19 @@ def test_decoders_that_regress_the_pose_do_best_without_regions():
     errors = {row["variant"]: row["mae_rotation"] for row in load("ablation")["rows"] if row["decoder"] == "pose"}
     assert max(errors["A"]) < min(errors["B"])
     assert max(errors["B"]) < min(errors["C"])
+
+
+def test_regions_with_positions_help_on_partial_pairs_and_regions_without_do_not():
+    rows = json.loads((HERE / "ablation/equal_time.json").read_text())["rows"]
+    grouped = {name: [row for row in rows if row["model"] == name] for name in equal_time.MODELS}
+
+    def share(name: str) -> tuple[float, float, float]:
+        return equal_time.ratio(grouped[name], grouped[equal_time.BASES[name]], equal_time.PARTIAL)
+
+    found, _, high = share("C, places, landmarks")
+    assert 0.75 < found < 0.87 and high < 1
+    for name in ("B, parts, landmarks", "C, places, pose"):
+        assert share(name)[0] > 1
 
 
 def test_nearest_neighbours_are_exact():
