@@ -18,7 +18,7 @@ from urrt_jax.host import PairOnHost, abstract_pair
 from urrt_jax.programs import Program
 from urrt_jax.registration import make_options
 from urrt_jax.search import Found
-from urrt_jax.stages import register_in_frame, rung
+from urrt_jax.stages import approach, register_in_frame, rung
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _USUAL = {"prepare", "recognise", "estimate", "approach", "settle", "compare", "assess", "label"}
@@ -220,19 +220,49 @@ def test_rare_stages_are_compiled_for_the_first_pair_that_needs_them(monkeypatch
     assert names() == _USUAL | {"expect", "search_thoroughly"}
 
 
-def test_of_the_finalists_the_one_that_fits_once_refined_is_kept(cloud):
-    turns = [_turn(150), _turn(97), _turn(30)]  # the truth is 100°
-    moved = _moved(cloud, 100) + np.random.default_rng(0).normal(scale=1e-3, size=cloud.shape)
+def _verified(source: np.ndarray, target: np.ndarray, turns: list[np.ndarray], search: Search, verify=stages._verified):
+    """The finalist that is kept of two clouds of one size, centred, of those with these turns."""
     options = make_options(None, ICP(), "auto")
-    *clouds, _ = PairOnHost(cloud, moved.astype(np.float32), None, None, None, None).padded(256)
-    source, target = (stages.prepare(stages.sizes_of(options), each) for each in clouds)
-    poses = rigid.Rigid(np.stack(turns).astype(np.float32), np.zeros((3, 3), np.float32))
+    *clouds, _ = PairOnHost(source, target.astype(np.float32), None, None, None, None).padded(256)
+    prepared = (stages.prepare(stages.sizes_of(options), each) for each in clouds)
+    poses = rigid.Rigid(np.stack(turns).astype(np.float32), np.zeros((len(turns), 3), np.float32))
     first = jax.tree.map(lambda leaf: leaf[0], poses)
     found = Found(first, np.float32(0.9), np.float32(0.3), np.bool_(True), poses)
-    for verified in (stages._verified, jax.jit(stages._verified)):
-        kept = verified(ICP(), source, target, found)
-        assert _degrees(kept.transform.rotation, _turn(100)) < 0.5
-        assert not kept.pending
+    return verify((ICP(), search), *prepared, found)
+
+
+@pytest.mark.parametrize("verify", [stages._verified, jax.jit(stages._verified)], ids=["arrays", "traced"])
+def test_of_the_finalists_the_one_that_fits_once_refined_is_kept(cloud, verify):
+    turns = [_turn(150), _turn(97), _turn(30)]  # the truth is 100°
+    moved = _moved(cloud, 100) + np.random.default_rng(0).normal(scale=1e-3, size=cloud.shape)
+    kept = _verified(cloud, moved, turns, Search(), verify)
+    assert _degrees(kept.transform.rotation, _turn(100)) < 0.5
+    assert not kept.pending
+
+
+def test_a_finalist_that_turns_too_far_is_not_kept(cloud):
+    turns = [_turn(30), _turn(97), _turn(150)]  # the truth is 100°
+    kept = _verified(cloud, _moved(cloud, 100), turns, Search(max_angle=60))
+    assert _degrees(kept.transform.rotation, np.eye(3)) < 61
+
+
+@pytest.mark.parametrize(("preference", "expected"), [(0.0, 180), (0.2, 0)])
+def test_of_finalists_that_fit_alike_the_one_that_turns_less_is_kept(cloud, preference, expected):
+    half = Rotation.from_rotvec(np.pi * _AXIS)
+    symmetric = np.concatenate([cloud[:100] - cloud[:100].mean(axis=0)] * 2)
+    symmetric[100:] = half.apply(symmetric[100:])
+    turns = [half.as_matrix(), np.eye(3), _turn(90)]
+    kept = _verified(symmetric.astype(np.float32), symmetric, turns, Search(preference=preference))
+    assert _degrees(kept.transform.rotation, _turn(expected)) < 1
+
+
+@pytest.mark.parametrize(("search", "expected"), [("auto", 0.2), (Search(preference=0.1), 0.1), (None, 0.0)])
+def test_the_first_pose_is_judged_by_what_turns_cost_in_the_search(monkeypatch, call, clean, search, expected):
+    told = []
+    monkeypatch.setattr(stages, "approach", lambda options, *rest: told.append(options[2]) or approach(options, *rest))
+    monkeypatch.setattr(registration, "start_compiling", lambda *_: None)
+    call(*clean, search=search)
+    assert told == [expected]
 
 
 def _random_pair(rng: np.random.Generator, cloud: np.ndarray) -> dict:

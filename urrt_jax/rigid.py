@@ -97,6 +97,24 @@ def rotation_angle(first: Array, second: Array) -> Array:
     return jnp.where(inside, 2 * jnp.arcsin(sine), end)
 
 
+def distinct(rotations: Array, worth: Array, *, count: int, apart: float) -> tuple[Array, Array]:
+    """The rows (count,) of the best of N rotations (N, 3, 3), best first, and whether there is one, (count,).
+
+    Args:
+      rotations: (N, 3, 3).
+      worth: (N,); -inf for those that are not considered.
+      count: how many are wanted.
+      apart: degrees; none of them is nearer than this to one before it.
+    """
+    angles = jax.vmap(lambda one: rotation_angle(one, rotations))(rotations)
+
+    def pick(worth: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+        best = jnp.argmax(worth)
+        return jnp.where(angles[best] < jnp.deg2rad(apart), -jnp.inf, worth), (best, worth[best] > -jnp.inf)
+
+    return jax.lax.scan(pick, worth, None, length=count)[1]
+
+
 def normalize(vector: Array, fallback: Array) -> Array:
     """The vector (3,) over its length; ``fallback`` (3,), with a zero derivative, where its length is nearly zero."""
     square = jnp.sum(vector**2)

@@ -414,7 +414,7 @@ def register_in_frame(
             found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
             if how is not None:
-                found = when(found.pending, _verified, (how, *clouds, found), found, least=search.DENSE)
+                found = when(found.pending, _verified, ((how, searching), *clouds, found), found, least=search.DENSE)
             pose = found.transform
     if how is not None:
         pose, width = found.transform, found.width
@@ -438,8 +438,9 @@ def register_in_frame(
     )
 
 
-def _verified(refiner: ICP, source: Prepared, target: Prepared, found: Found) -> Found:
+def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, found: Found) -> Found:
     """The finalist in which dense clouds fit best, once all have been refined: a stage of other stages."""
+    refiner, searching = options
 
     def refined(pose: Rigid) -> Rigid:
         width = found.width
@@ -457,7 +458,7 @@ def _verified(refiner: ICP, source: Prepared, target: Prepared, found: Found) ->
         rows = range(search.FINALISTS)
         each = [refined(jax.tree.map(lambda leaf, row=row: leaf[row], found.finalists)) for row in rows]
         ends = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
-    return verify(None, source.samples, target.samples, found, ends)
+    return verify(searching, source.samples, target.samples, found, ends)
 
 
 def _not_known(cloud: Cloud) -> Known:

@@ -7,9 +7,9 @@ regions are parts. Pairs are of test shapes. Consistency is the share of points 
 the same region: before anything is aligned, on four protocols, and in the last step of the network on clean pairs. A
 point's counterpart is the nearest one under the true pose, if it lies within 0.1. Centroids of regions correspond as
 far as regions do: the error of the pose that aligns them (Procrustes, each region weighing what eq. 3 gives it, nothing
-else of the network) tells how far that goes. Occupancy accuracy is the share of
-places about the clean target that the branches call inside or outside rightly. Writes results.json, table.md,
-places.png and parts.png beside this file; with --model it measures another network and prints only.
+else of the network) tells how far that goes. Occupancy accuracy is the share of places about the clean target that the
+branches call inside or outside rightly. Writes results.json, table.md, places.png and parts.png beside this file; with
+--model it measures another network and prints only.
 """
 
 import argparse

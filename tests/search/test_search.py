@@ -284,9 +284,23 @@ def test_finalists_are_the_best_poses_that_are_far_from_each_other():
     turns = np.stack([_turn(angle) for angle in angles]).astype(np.float32)
     poses = rigid.Rigid(jnp.asarray(turns), jnp.zeros((6, 3)))
     found = jax.tree.map(lambda leaf: leaf[0], poses)
-    np.testing.assert_array_equal(_finalists(found, poses, scores).rotation, turns[[0, 3, 5]])
+    np.testing.assert_array_equal(_finalists(found, poses, scores, Search()).rotation, turns[[0, 3, 5]])
     alike = jax.tree.map(lambda leaf: leaf[:2], poses)
-    np.testing.assert_array_equal(_finalists(found, alike, scores[:2]).rotation, turns[[0, 0, 0]])
+    np.testing.assert_array_equal(_finalists(found, alike, scores[:2], Search()).rotation, turns[[0, 0, 0]])
+    near = _finalists(found, poses, scores, Search(max_angle=98))  # poses that turn farther are not considered
+    np.testing.assert_array_equal(near.rotation, turns[[0, 3, 4]])
+    dear = _finalists(found, poses, scores, Search(preference=1.0))  # what turns cost decides at last
+    np.testing.assert_array_equal(dear.rotation, turns[[0, 3, 5]])
+
+
+@pytest.mark.parametrize(("dense", "pending"), [(DENSE, False), (100, True)])
+def test_what_a_thorough_search_of_dense_clouds_finds_is_still_to_be_verified(
+    small_model, cloud, monkeypatch, dense, pending
+):
+    monkeypatch.setattr("urrt_jax.search.search.DENSE", dense)
+    samples = _samples(_pad(cloud), _pad(cloud))
+    found = jax.jit(lambda: search_thoroughly((_SMALL, small_model), *samples, _plain()))()
+    assert bool(found.pending) == pending
 
 
 @pytest.mark.parametrize("degrees", [0, 60, 120, 180])

@@ -202,14 +202,8 @@ def _compare(turns: Rigid, clouds: tuple[Cloud, Cloud], spacing: Array) -> Array
 
 def _distinct(rotations: Array, significance: Array) -> tuple[Array, Array]:
     """The rows (``KEPT``,) of the best rotations, none within 20° of another or of none, and whether there is."""
-    angles = jax.vmap(lambda one: rigid.rotation_angle(one, rotations))(rotations)
     usable = rigid.rotation_angle(rotations, jnp.eye(3)) > jnp.deg2rad(_SAME)
-
-    def pick(worth: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-        best = jnp.argmin(worth)
-        return jnp.where(angles[best] < jnp.deg2rad(_SAME), jnp.inf, worth), (best, worth[best] < jnp.inf)
-
-    return jax.lax.scan(pick, jnp.where(usable, significance, jnp.inf), None, length=KEPT)[1]
+    return rigid.distinct(rotations, jnp.where(usable, -significance, -jnp.inf), count=KEPT, apart=_SAME)
 
 
 def _rotations_evenly(count: int) -> np.ndarray:

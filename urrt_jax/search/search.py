@@ -6,7 +6,8 @@ network's landmarks (``model.network.propose``), which sparse and noisy clouds l
 The 64 hypotheses in which the clouds agree best, in both directions, are refined briefly on few points. The best four
 of these and the plain pose are refined on the whole subsample, and the one that fits best is kept. Dense clouds, such
 as scans, get a quick look first, at 512 points and their features alone. Its pose is taken where it fits well, or where
-most of the best hypotheses end in it. (These numbers are the defaults of ``Search``.)
+most of the best hypotheses end in it. (These numbers are the defaults of ``Search``.) Otherwise the three best poses of
+the thorough search that are far from each other are refined, and that which fits best at up to 4,096 points is kept.
 """
 
 import dataclasses
@@ -105,14 +106,14 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     return found._replace(pending=dense)
 
 
-def verify(_: None, source: Samples, target: Samples, found: Found, refined: Rigid) -> Found:
-    """Of the finalists of dense clouds, all refined, the one in which these fit best.
+def verify(search: Search, source: Samples, target: Samples, found: Found, refined: Rigid) -> Found:
+    """Of the finalists of dense clouds, all refined, the one in which these fit best, for how far it turns.
 
     Where little overlaps, the few points of a search hardly tell surfaces that cross from surfaces that lie on each
     other. Here as many as there are samples tell them apart.
 
     Args:
-      _: shared by the pairs of a batch; here it is nothing.
+      search: how it was searched.
       source: samples of the source, in units of the clouds' radius.
       target: samples of the target.
       found: what a search has found.
@@ -122,8 +123,9 @@ def verify(_: None, source: Samples, target: Samples, found: Found, refined: Rig
     clouds = source.thinned, target.thinned
     width = coarser_spacing(*clouds)
     scores = jax.lax.map(lambda pose: fit_samples(*clouds, pose, width).score, refined)  # compiled once
-    best = jnp.argmax(scores)
-    return found._replace(transform=jax.tree.map(lambda leaf: leaf[best], refined), pending=jnp.array(False))
+    poses, best = _best(refined, scores, 1, _cheaper(search, jnp.array(True)))
+    best_pose = jax.tree.map(lambda leaf: leaf[0], poses)
+    return found._replace(transform=rigid.choose(best[0] >= 0, best_pose, found.transform), pending=jnp.array(False))
 
 
 def _choose(
@@ -152,33 +154,35 @@ def _choose(
     found = jax.tree.map(lambda leaf, given: jnp.where(best[0] >= 0, leaf[0], given), poses, plain)
     alike = rigid.rotation_angle(full.rotation[2:], found.rotation) < jnp.deg2rad(_ALIKE)
     unanimous = jnp.sum(alike) > 0.5 * alike.shape[0]
-    finalists = _finalists(found, full, scores)
+    finalists = _finalists(found, full, scores, search)
     return Found(found, jnp.maximum(best[0], 0.0), width, jnp.array(False), finalists), unanimous
 
 
-def _finalists(found: Rigid, poses: Rigid, scores: Array) -> Rigid:
-    """The pose found and the best of H others, each far from those before it."""
+def _finalists(found: Rigid, poses: Rigid, scores: Array, search: Search) -> Rigid:
+    """The pose found and those of H others that fit best and do not turn too far, each far from those before it.
 
-    def pick(left: tuple[Rigid, Array], _: None) -> tuple[tuple[Rigid, Array], Rigid]:
-        before, scores = left
-        alike = rigid.rotation_angle(poses.rotation, before.rotation) < jnp.deg2rad(_APART)
-        scores = jnp.where(alike, -jnp.inf, scores)
-        row = jnp.argmax(scores)
-        best = jax.tree.map(lambda leaf, given: jnp.where(scores[row] > -jnp.inf, leaf[row], given), poses, found)
-        return (best, scores), best
-
-    others = jax.lax.scan(pick, (found, scores), None, length=FINALISTS - 1)[1]
-    return jax.tree.map(lambda own, leaf: jnp.concatenate([own[None], leaf]), found, others)
+    What turns cost is not asked here: the pose found was chosen by it, and ``verify`` asks again.
+    """
+    far = rigid.rotation_angle(poses.rotation, found.rotation) > jnp.deg2rad(_APART)
+    scores = jnp.where(far & _worth(poses, scores, search)[1], scores, -jnp.inf)
+    rows, there = rigid.distinct(poses.rotation, scores, count=FINALISTS - 1, apart=_APART)
+    others = jax.vmap(lambda row, is_there: rigid.choose(is_there, jax.tree.map(lambda leaf: leaf[row], poses), found))
+    return jax.tree.map(lambda own, leaf: jnp.concatenate([own[None], leaf]), found, others(rows, there))
 
 
 def _best(poses: Rigid, scores: Array, count: int, search: Search) -> tuple[Rigid, Array]:
     """The ``count`` best of H poses and their scores, best first; -1 for those that turn too far."""
+    worth, allowed = _worth(poses, scores, search)
+    _, rows = jax.lax.top_k(worth, min(count, len(worth)))
+    return jax.tree.map(lambda leaf: leaf[rows], poses), jnp.where(allowed, scores, -1.0)[rows]
+
+
+def _worth(poses: Rigid, scores: Array, search: Search) -> tuple[Array, Array]:
+    """What H poses are worth, (H,): their scores less what their turns cost; and whether they may turn so far, (H,)."""
     turn = rigid.rotation_angle(poses.rotation, jnp.eye(3)) / jnp.deg2rad(search.max_angle)
     allowed = turn <= 1 + 1e-4
     # With what turns cost, allowed poses are worth -preference at least.
-    worth = jnp.where(allowed, scores - cost(search.preference, turn), -1.0 - search.preference)
-    _, rows = jax.lax.top_k(worth, min(count, len(worth)))
-    return jax.tree.map(lambda leaf: leaf[rows], poses), jnp.where(allowed, scores, -1.0)[rows]
+    return jnp.where(allowed, scores - cost(search.preference, turn), -1.0 - search.preference), allowed
 
 
 def cost(preference: Array | float, turn: Array) -> Array:
