@@ -22,7 +22,7 @@ from urrt_jax.stages import approach, register_in_frame, rung
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _USUAL = {"prepare", "recognise", "estimate", "approach", "settle", "compare", "assess", "label"}
-_RARE = {"search_quickly", "search_thoroughly", "verify", "settle_thinned", "expect"}
+_RARE = {"search_quickly", "search_thoroughly", "choose_finalist", "settle_thinned", "expect"}
 _AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
 _SHIFT = np.array([0.4, -0.2, 0.7])
 
@@ -186,9 +186,9 @@ _LARGE = {"settle_thinned"}  # of more than 4,096 points, which nearly all pairs
     [
         (256, False, _USUAL),
         (256, True, _USUAL | {"search_thoroughly", "expect"}),
-        (4096, True, _USUAL | {"search_quickly", "search_thoroughly", "verify"}),
+        (4096, True, _USUAL | {"search_quickly", "search_thoroughly", "choose_finalist"}),
         (16_384, False, _USUAL | _LARGE),
-        (16_384, True, _USUAL | _LARGE | {"search_quickly", "search_thoroughly", "verify"}),
+        (16_384, True, _USUAL | _LARGE | {"search_quickly", "search_thoroughly", "choose_finalist"}),
     ],
 )
 def test_what_is_compiled_ahead_on_a_rung(compiled, small_model, size, rare, expected):
@@ -202,7 +202,7 @@ def test_clouds_of_50_to_a_million_points_take_41_programs(compiled, small_model
     for size in sorted({rung(int(count)) for count in np.geomspace(50, 1_000_000, 1000)}):
         register_in_frame(options, *abstract_pair(size), rare=True)
     on_rungs = dict.fromkeys(("prepare", "settle", "assess", "label"), 7) | {"settle_thinned": 4, "expect": 2}
-    once = ("recognise", "estimate", "approach", "search_quickly", "search_thoroughly", "verify", "compare")
+    once = ("recognise", "estimate", "approach", "search_quickly", "search_thoroughly", "choose_finalist", "compare")
     assert collections.Counter(compiled.values()) == on_rungs | dict.fromkeys(once, 1)
 
 
@@ -223,15 +223,15 @@ def test_rare_stages_are_compiled_for_the_first_pair_that_needs_them(monkeypatch
 def _verified(source: np.ndarray, target: np.ndarray, turns: list[np.ndarray], search: Search, verify=stages._verified):
     """The finalist that is kept of two clouds of one size, centred, of those with these turns."""
     options = make_options(None, ICP(), "auto")
-    *clouds, _ = PairOnHost(source, target.astype(np.float32), None, None, None, None).padded(256)
+    *clouds, told = PairOnHost(source, target.astype(np.float32), None, None, None, None).padded(256)
     prepared = (stages.prepare(stages.sizes_of(options), each) for each in clouds)
     poses = rigid.Rigid(np.stack(turns).astype(np.float32), np.zeros((len(turns), 3), np.float32))
     first = jax.tree.map(lambda leaf: leaf[0], poses)
     found = Found(first, np.float32(0.9), np.float32(0.3), np.bool_(True), poses)
-    return verify((ICP(), search), *prepared, found)
+    return verify((ICP(), search), *prepared, found, told)
 
 
-@pytest.mark.parametrize("verify", [stages._verified, jax.jit(stages._verified)], ids=["arrays", "traced"])
+@pytest.mark.parametrize("choose_finalist", [stages._verified, jax.jit(stages._verified)], ids=["arrays", "traced"])
 def test_of_the_finalists_the_one_that_fits_once_refined_is_kept(cloud, verify):
     turns = [_turn(150), _turn(97), _turn(30)]  # the truth is 100°
     moved = _moved(cloud, 100) + np.random.default_rng(0).normal(scale=1e-3, size=cloud.shape)

@@ -14,9 +14,10 @@ A registration takes these steps. Each one after the first is a *stage*: a progr
    initial transform takes its place where it fits better.
 5. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. It calls for a search
    where the samples do not fit in it, or not well enough for how far it turns.
-6. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``, ``verify``; rare). Matched FPFH features and
-   the network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Of dense clouds
-   three finalists go through the next stage, and the one in which the clouds then fit best is kept. Nothing is random.
+6. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``, ``choose_finalist``; rare). Matched FPFH
+   features and the network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Of
+   dense clouds three finalists go through stages 7 to 9, and the one in which the whole clouds then fit best is kept.
+   Nothing is random.
 7. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
    directions, among the full clouds, mostly point to plane. The bandwidth of its weights shrinks to the spacing, and
    then to the spread of the distances themselves, so that points without a counterpart do not pull. Small clouds whose
@@ -155,6 +156,18 @@ class Report(NamedTuple):
     alternatives: OtherPoses
 
 
+class Assessment(NamedTuple):
+    """What is found out about a transform.
+
+    Attributes:
+      report: what is said of it.
+      score: (), in [0, 1]: how well the whole clouds lie on each other (``Fit.score``).
+    """
+
+    report: Report
+    score: Array
+
+
 class Options(NamedTuple):
     """What the user chose.
 
@@ -278,8 +291,8 @@ def assess(
     settled: Array,
     others: Alternatives,
     told: Told,
-) -> Report:
-    """What is to be said of a transform."""
+) -> Assessment:
+    """What is found out about a transform."""
     found = fit(source, target, transform, told.inlier_distance)
     # Derivatives pass through the distances of these neighbours, which are as they are.
     moved, nearest = rigid.apply(transform, source.cloud.points), target.cloud.points[found.nearest]
@@ -315,7 +328,7 @@ def assess(
     outcome = jnp.select(list(outcomes.values()), [jnp.int32(each) for each in outcomes])
     against = jnp.where(usable, odds(others), 0.0)
     unknown = jnp.diag(jnp.array(_UNKNOWN, precise.covariance.dtype))
-    return Report(
+    report = Report(
         fitness=fitness,
         rmse=rmse,
         inlier_distance=reach,
@@ -328,6 +341,7 @@ def assess(
         covariance=jnp.where(usable & (precise.pairs > _FEWEST), precise.covariance, unknown),
         alternatives=OtherPoses(*others.poses, against / (1 + jnp.sum(against))),
     )
+    return Assessment(report, found.score)
 
 
 @Program
@@ -344,7 +358,7 @@ def label(_: None, cloud: Prepared, seen: Seen) -> Array:
 prepare = Program(prepared.prepare)
 search_quickly = Program(search.search_quickly)
 search_thoroughly = Program(search.search_thoroughly)
-verify = Program(search.verify)
+choose_finalist = Program(search.choose_finalist)
 settle_thinned = Program(refine.settle_thinned)
 settle = Program(refine.settle)
 expect = Program(refine.expect)
@@ -414,7 +428,8 @@ def register_in_frame(
             found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
             if how is not None:
-                found = when(found.pending, _verified, ((how, searching), *clouds, found), found, least=search.DENSE)
+                asked = (how, searching), *clouds, found, told
+                found = when(found.pending, _verified, asked, found, least=search.DENSE)
             pose = found.transform
     if how is not None:
         pose, width = found.transform, found.width
@@ -427,7 +442,7 @@ def register_in_frame(
         if mode == "traced":
             pose = refine.differentiable_pose(how, *clouds, end, last)
     others = call(compare, None, *samples, pose)
-    report = call(assess, how is not None, *clouds, pose, settled, others, told)
+    report = call(assess, how is not None, *clouds, pose, settled, others, told).report
     return Outputs(
         transform=pose,
         coarse=start.coarse,
@@ -438,27 +453,31 @@ def register_in_frame(
     )
 
 
-def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, found: Found) -> Found:
+def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, found: Found, told: Told) -> Found:
     """The finalist in which dense clouds fit best, once all have been refined: a stage of other stages."""
     refiner, searching = options
 
-    def refined(pose: Rigid) -> Rigid:
+    def judged(pose: Rigid) -> tuple[Rigid, Array]:
+        """Where refinement of a pose ends, and how well the clouds fit there."""
         width = found.width
         if source.cloud.mask.shape[-1] > THINNED:
             pose, width = settle_thinned(refiner, source, target, pose, width)
-        return settle(refiner, source, target, pose, width).transform
+        end = settle(refiner, source, target, pose, width)
+        others = compare(None, source.samples, target.samples, end.transform)
+        assessment = assess(True, source, target, end.transform, end.converged, others, told)
+        return end.transform, assessment.score
 
     mode = _mode(source, target, found)
     if mode == "traced":
-        ends = jax.lax.map(refined, found.finalists)
+        ends = jax.lax.map(judged, found.finalists)
     elif mode == "abstract":
-        refined(found.transform)
-        ends = found.finalists
+        one = judged(found.transform)
+        ends = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((search.FINALISTS, *leaf.shape), leaf.dtype), one)
     else:
         rows = range(search.FINALISTS)
-        each = [refined(jax.tree.map(lambda leaf, row=row: leaf[row], found.finalists)) for row in rows]
+        each = [judged(jax.tree.map(lambda leaf, row=row: leaf[row], found.finalists)) for row in rows]
         ends = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
-    return verify(searching, source.samples, target.samples, found, ends)
+    return choose_finalist(searching, found, *ends)
 
 
 def _not_known(cloud: Cloud) -> Known:

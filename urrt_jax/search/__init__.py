@@ -9,11 +9,11 @@ from urrt_jax.search.search import (
     DENSE,
     FINALISTS,
     Found,
+    choose_finalist,
     cost,
     preference_among,
     search_quickly,
     search_thoroughly,
-    verify,
 )
 
 __all__ = [
@@ -21,10 +21,10 @@ __all__ = [
     "FINALISTS",
     "Found",
     "Search",
+    "choose_finalist",
     "cost",
     "find_counterparts",
     "preference_among",
     "search_quickly",
     "search_thoroughly",
-    "verify",
 ]

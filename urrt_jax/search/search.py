@@ -7,7 +7,7 @@ The 64 hypotheses in which the clouds agree best, in both directions, are refine
 of these and the plain pose are refined on the whole subsample, and the one that fits best is kept. Dense clouds, such
 as scans, get a quick look first, at 512 points and their features alone. Its pose is taken where it fits well, or where
 most of the best hypotheses end in it. (These numbers are the defaults of ``Search``.) Otherwise the three best poses of
-the thorough search that are far from each other are refined, and that which fits best at up to 4,096 points is kept.
+the thorough search that are far from each other are refined, and the one in which the whole clouds fit best is kept.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ class Found(NamedTuple):
       transform: source to target; no derivative passes.
       score: (), in [0, 1]: how well the subsamples' surfaces lie on each other (``Fit.score``).
       width: (), the distance within which the transform can be trusted: the subsample's spacing.
-      pending: (), bool, whether more is called for: a search, a more thorough one, and at last ``verify``.
+      pending: (), bool, whether more is called for: a search, a more thorough one, at last a choice among finalists.
       finalists: stacked, this pose and the next best ones, each far from those before it; it again where there is none.
     """
 
@@ -106,26 +106,22 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     return found._replace(pending=dense)
 
 
-def verify(search: Search, source: Samples, target: Samples, found: Found, refined: Rigid) -> Found:
+def choose_finalist(search: Search, found: Found, refined: Rigid, scores: Array) -> Found:
     """Of the finalists of dense clouds, all refined, the one in which these fit best, for how far it turns.
 
     Where little overlaps, the few points of a search hardly tell surfaces that cross from surfaces that lie on each
-    other. Here as many as there are samples tell them apart.
+    other. Whole clouds do.
 
     Args:
       search: how it was searched.
-      source: samples of the source, in units of the clouds' radius.
-      target: samples of the target.
       found: what a search has found.
       refined: where refinement of its finalists ends, stacked.
+      scores: (F,), how well the whole clouds fit there (``Fit.score``).
     """
-    source, target, found, refined = jax.lax.stop_gradient((source, target, found, refined))
-    clouds = source.thinned, target.thinned
-    width = coarser_spacing(*clouds)
-    scores = jax.lax.map(lambda pose: fit_samples(*clouds, pose, width).score, refined)  # compiled once
     poses, best = _best(refined, scores, 1, _cheaper(search, jnp.array(True)))
     best_pose = jax.tree.map(lambda leaf: leaf[0], poses)
-    return found._replace(transform=rigid.choose(best[0] >= 0, best_pose, found.transform), pending=jnp.array(False))
+    transform = rigid.choose(best[0] >= 0, best_pose, found.transform)
+    return found._replace(transform=transform, score=jnp.maximum(best[0], 0.0), pending=jnp.array(False))
 
 
 def _choose(
@@ -161,7 +157,7 @@ def _choose(
 def _finalists(found: Rigid, poses: Rigid, scores: Array, search: Search) -> Rigid:
     """The pose found and those of H others that fit best and do not turn too far, each far from those before it.
 
-    What turns cost is not asked here: the pose found was chosen by it, and ``verify`` asks again.
+    What turns cost is not asked here: the pose found was chosen by it, and ``choose_finalist`` asks again.
     """
     far = rigid.rotation_angle(poses.rotation, found.rotation) > jnp.deg2rad(_APART)
     scores = jnp.where(far & _worth(poses, scores, search)[1], scores, -jnp.inf)
