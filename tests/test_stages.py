@@ -231,7 +231,7 @@ def _verified(source: np.ndarray, target: np.ndarray, turns: list[np.ndarray], s
     return verify((ICP(), search), *prepared, found, told)
 
 
-@pytest.mark.parametrize("choose_finalist", [stages._verified, jax.jit(stages._verified)], ids=["arrays", "traced"])
+@pytest.mark.parametrize("verify", [stages._verified, jax.jit(stages._verified)], ids=["arrays", "traced"])
 def test_of_the_finalists_the_one_that_fits_once_refined_is_kept(cloud, verify):
     turns = [_turn(150), _turn(97), _turn(30)]  # the truth is 100°
     moved = _moved(cloud, 100) + np.random.default_rng(0).normal(scale=1e-3, size=cloud.shape)

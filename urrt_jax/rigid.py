@@ -97,20 +97,28 @@ def rotation_angle(first: Array, second: Array) -> Array:
     return jnp.where(inside, 2 * jnp.arcsin(sine), end)
 
 
-def distinct(rotations: Array, worth: Array, *, count: int, apart: float) -> tuple[Array, Array]:
-    """The rows (count,) of the best of N rotations (N, 3, 3), best first, and whether there is one, (count,).
+def distinct(
+    poses: Rigid, worth: Array, *, count: int, apart: float, shift: Array | float = jnp.inf
+) -> tuple[Array, Array]:
+    """The rows (count,) of the best of N poses, best first, and whether there is one, (count,).
 
     Args:
-      rotations: (N, 3, 3).
+      poses: rotation (N, 3, 3) and translation (N, 3).
       worth: (N,); -inf for those that are not considered.
       count: how many are wanted.
-      apart: degrees; none of them is nearer than this to one before it.
+      apart: degrees; none of them turns by less than this from one before it, unless it is farther off than ``shift``.
+      shift: by default translations do not matter.
     """
-    angles = jax.vmap(lambda one: rotation_angle(one, rotations))(rotations)
+
+    def same(one: Rigid) -> Array:
+        turned = rotation_angle(one.rotation, poses.rotation) < jnp.deg2rad(apart)
+        return turned & (jnp.linalg.norm(one.translation - poses.translation, axis=-1) < shift)
+
+    alike = jax.vmap(same)(poses)
 
     def pick(worth: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.argmax(worth)
-        return jnp.where(angles[best] < jnp.deg2rad(apart), -jnp.inf, worth), (best, worth[best] > -jnp.inf)
+        return jnp.where(alike[best], -jnp.inf, worth), (best, worth[best] > -jnp.inf)
 
     return jax.lax.scan(pick, worth, None, length=count)[1]
 

@@ -159,8 +159,8 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
     """Mean angles with their deviation over seeds, and the ratio to model A on the partial protocols."""
     heads = " | ".join(PROTOCOLS.values())
     lines = [
-        f"| mean angle | {heads} | error on partial pairs, of A's | pairs seen | minutes |",
-        "|---|" + "---:|" * (len(PROTOCOLS) + 3),
+        f"| mean angle | {heads} | error on partial pairs, of A's | pairs seen |",
+        "|---|" + "---:|" * (len(PROTOCOLS) + 2),
     ]
     grouped = {name: [row for row in rows if row["model"] == name] for name in MODELS}
     for name, some in grouped.items():
@@ -175,7 +175,7 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
             cells.append("1" if bases else "–")
         else:
             cells.append("{:.2f} ({:.2f} to {:.2f})".format(*ratio(some, bases, PARTIAL)))
-        cells += [f"{BATCH * some[0]['steps']:,}", f"{np.mean([row['seconds'] for row in some]) / 60:.1f}"]
+        cells.append(f"{BATCH * some[0]['steps']:,}")
         lines.append(f"| {name}, {len(some)} seed{'s' * (len(some) > 1)} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 

@@ -11,6 +11,7 @@ import numpy as np
 import urrt_jax
 from experiments.reproduce.tables import heading
 from urrt_jax.evaluation import find_method, find_protocol
+from urrt_jax.evaluation.scans import LEAST_OVERLAP
 from urrt_jax.weights import model_card
 
 EXPERIMENTS = Path(__file__).parents[1]
@@ -46,6 +47,7 @@ class Part(_Table):
       published: published numbers, one row per title: a list in the order of the experiment's `published_columns`, or
         a table of numbers by column.
       columns: the columns of this part, if they differ from the experiment's.
+      overlap: of scans, from how much to less than how much pairs overlap.
       stride: measure one item in this many, where all would take too long; the table states it.
       first: measure at most this many of those items, the first ones; None for all.
       note: text under the title.
@@ -56,6 +58,7 @@ class Part(_Table):
     points: int = 1024
     data: str | None = None
     unseen: bool = False
+    overlap: tuple[float, float] = (LEAST_OVERLAP, np.inf)
     methods: tuple[str, ...] | None = None
     columns: tuple[str, ...] | None = None
     published: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -163,6 +166,8 @@ def _check(experiment: Experiment) -> None:
         if each.stride < 1 or each.points < 1:
             raise ValueError(f"stride and points: expected at least 1, got {each.stride} and {each.points}")
     for part in experiment.parts:
+        if len(part.overlap) != 2 or not 0 <= part.overlap[0] < part.overlap[1]:
+            raise ValueError(f"overlap: expected the least, and a larger one that is too much, got {part.overlap}")
         if part.first is not None and part.first < 1:
             raise ValueError(f"first: expected at least 1, got {part.first}")
     for name in {

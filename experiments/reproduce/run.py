@@ -239,7 +239,7 @@ class _Runner:
 
     def _load(self, part: Part) -> tuple[Any, np.ndarray, list[dict], str]:
         """The part's data, whether each item is axisymmetric (S,), facts about each pair of scans, and a name."""
-        key = (part.data, part.points, part.unseen, part.protocol == "scans")
+        key = (part.data, part.points, part.unseen, part.overlap, part.protocol == "scans")
         if key not in self._loaded:
             self._loaded[key] = self._read(part)
         return self._loaded[key]
@@ -248,7 +248,7 @@ class _Runner:
         """As `_load`, from the files."""
         source, unseen = Path(self.data) / part.data if part.data else Path(self.data), part.unseen
         if part.protocol == "scans":
-            pairs, about = load_scan_pairs(source)
+            pairs, about = load_scan_pairs(source, least_overlap=part.overlap[0], below_overlap=part.overlap[1])
             return pairs, np.zeros(len(pairs), bool), about, source.name
         if part.data and not source.exists():
             # The folder itself may have enough points: the HDF5 release of ModelNet40 has 2,048 per shape. Parts that

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from urrt_jax.clouds import Cloud, centroid, first, make_cloud
-from urrt_jax.clouds.normals import least_axis, normals
+from urrt_jax.clouds.normals import face_alike, least_axis, normals
 
 _RADIUS = 0.3
 _ROWS = 400  # of which all but a cloud's are padding: compiling takes far longer than running
@@ -287,3 +288,49 @@ def test_derivative_of_normals_agrees_with_finite_differences(points, both, x64)
     _, slope = jax.jvp(at, (0.0,), (1.0,))
     expected = (at(1e-7) - at(-1e-7)) / 2e-7
     np.testing.assert_allclose(slope, expected, atol=1e-5 * float(jnp.max(jnp.abs(expected))))
+
+
+def _shell(count: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Points of an open, wavy sheet, as a scan sees it, about their centroid, and normals that all face one way."""
+    x, y = np.random.default_rng(0).uniform(-1, 1, (2, count))
+    points = np.stack([x, y, 0.2 * np.sin(4 * x)], axis=1)
+    facing = np.stack([-0.8 * np.cos(4 * x), np.zeros(count), np.ones(count)], axis=1)
+    points, facing = points - points.mean(axis=0), facing / np.linalg.norm(facing, axis=1, keepdims=True)
+    return points.astype(np.float32), facing.astype(np.float32)
+
+
+def _at_odds(found, points: np.ndarray) -> float:
+    """The share of points whose normal faces away from that of their nearest neighbour."""
+    found, nearest = np.asarray(found), KDTree(points).query(points, k=2)[1][:, 1]
+    return np.mean(np.sum(found * found[nearest], axis=1) < 0)
+
+
+def test_normals_of_patches_of_an_open_sheet_are_made_to_agree():
+    points, facing = _shell()
+    rough = facing * np.where(np.random.default_rng(1).uniform(size=(400, 1)) < 0.2, -1, 1).astype(np.float32)
+    rough = np.where(points[:, :1] > 0, rough, -rough)  # two halves that face opposite ways
+    found = face_alike(rough, make_cloud(points), 0.1, steps=16)
+    assert _at_odds(rough, points) > 0.25
+    assert _at_odds(found, points) < 0.04  # where the halves meet
+
+
+def test_a_few_normals_that_are_the_wrong_way_around_are_turned():
+    outward = _sphere(400)
+    wrong = outward.copy()
+    wrong[np.random.default_rng(0).permutation(400)[:40]] *= -1
+    np.testing.assert_array_equal(face_alike(wrong, make_cloud(outward), 0.2, steps=16), outward)
+
+
+def test_normals_whose_neighbours_are_not_asked_point_outward():
+    points, facing = _shell()
+    outward = np.where(np.sum(points * facing, axis=1, keepdims=True) < 0, -facing, facing)
+    np.testing.assert_array_equal(face_alike(outward, make_cloud(points), 0.2, steps=0), outward)
+
+
+def test_padding_does_not_vote():
+    points, facing = _shell()
+    outward = np.where(np.sum(points * facing, axis=1, keepdims=True) < 0, -facing, facing)
+    alone = face_alike(outward, make_cloud(points), 0.1, steps=16)
+    cloud = make_cloud(np.concatenate([points, points]), np.arange(800) < 400)
+    padded = face_alike(np.concatenate([outward, -facing]), cloud, 0.1, steps=16)
+    np.testing.assert_array_equal(padded[:400], alone)

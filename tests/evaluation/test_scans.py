@@ -39,6 +39,13 @@ def test_pairs_that_overlap_come_in_both_orders(scans):
     assert all(0.6 < each["overlap"] < 0.75 for each in about)
 
 
+def test_pairs_that_overlap_less_may_be_asked_for_alone(scans):
+    _, every = load_scan_pairs(scans, least_overlap=0.01)
+    _, about = load_scan_pairs(scans, least_overlap=0.01, below_overlap=0.4)
+    assert {(each["source"], each["target"]) for each in about} == {("middle", "right"), ("right", "middle")}
+    assert [each for each in every if each["overlap"] < 0.4] == about
+
+
 def test_truth_lays_the_source_on_the_target(scans):
     (trial, back), _ = load_scan_pairs(scans)
     moved = trial.source @ trial.rotation.T + trial.translation

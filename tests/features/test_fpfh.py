@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from urrt_jax.clouds import Cloud, centroid, first, make_cloud
 from urrt_jax.clouds.normals import normals
-from urrt_jax.features import fpfh
+from urrt_jax.features import fpfh, turned_around
 from urrt_jax.features.fpfh import BINS, _shares, _turn
 
 _RADIUS = 0.5
@@ -71,6 +71,13 @@ def test_rigid_motion_with_the_normals_changes_nothing(cloud, surface, seed, of)
     moved = (cloud @ rotation.T + [1.0, -2.0, 0.5]).astype(np.float32)
     found = _fpfh(make_cloud(moved), (directions @ rotation.T).astype(np.float32), _RADIUS)
     np.testing.assert_allclose(found, _fpfh(make_cloud(cloud), directions, _RADIUS), atol=2e-4)
+
+
+@pytest.mark.parametrize("of", ["surface", "random"])
+def test_features_with_all_normals_turned_around_are_known_from_those_without(cloud, surface, of):
+    directions = surface if of == "surface" else _random_normals(len(cloud))
+    found = turned_around(_fpfh(make_cloud(cloud), directions, _RADIUS))
+    np.testing.assert_allclose(found, _fpfh(make_cloud(cloud), -directions, _RADIUS), atol=1e-5)
 
 
 def test_a_reflection_is_noticed(cloud, surface, expected):

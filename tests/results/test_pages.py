@@ -186,6 +186,8 @@ RESULTS = (
     f"Without a search `register` finds {100 * _beyond('scans', 'plain', 'recall_5deg_0.05'):.0f} % of the pairs",
     f"finds {_beyond('scans', 'plain', 'recall_2deg_0.02'):.3f} of the scans within 2° in the table above, and "
     f"{_figure('default_call', 'scans', 'plain', 'recall_2deg_0.02'):.3f} in the later",
+    f"The default call finds {_figure('default_call', 'scans', 'register', 'recall_5deg_0.05', 1):.3f} of them, "
+    f"and the best peer {_figure('default_call', 'scans', 'scan_ransac', 'recall_5deg_0.05', 1):.3f}",
     f"{_range('beyond_5', _SIZES)} % are more than 5° wrong",
     f"{_range('beyond_45', [row for row in _SIZES if row['pairs_of'] != '2048 points'])} % are more than 45° wrong",
     f"at least {int(100 * min(row['right_asymmetric_called'] for row in _SIZES[3:]))} % of the right poses",

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from urrt_jax.clouds import make_cloud
-from urrt_jax.search.matches import Matches, match_features, poses_from_matches
+from urrt_jax.search.matches import Matches, match_most_similar, poses_from_matches
 
 _COUNT = 100
 _ALL = np.ones(_COUNT, bool)
@@ -16,7 +16,7 @@ _ALL = np.ones(_COUNT, bool)
 @jax.jit
 def _poses(source, target, row, mutual, distance=0.05):
     clouds = make_cloud(source), make_cloud(target)
-    return poses_from_matches(*clouds, Matches(row, mutual), distance, count=8, support=8)
+    return poses_from_matches(*clouds, Matches(row, mutual), distance, seeds=8, count=8, support=8)
 
 
 def _problem(seed: int, wrong: int, noise: float = 0.0):
@@ -38,7 +38,7 @@ def _match(source, target, source_mask=None, target_mask=None) -> Matches:
         jnp.ones(len(features), bool) if mask is None else jnp.asarray(mask, bool)
         for features, mask in ((source, source_mask), (target, target_mask))
     ]
-    return match_features(source, target, *masks)
+    return match_most_similar(source @ target.T, *masks)
 
 
 def test_match_is_the_most_similar_feature():
@@ -216,8 +216,31 @@ def test_pose_of_three_points_is_exact():
     source = rng.normal(size=(3, 3)).astype(np.float32)
     target = source @ _TURN.T + _OFFSET
     matches = Matches(jnp.arange(3), jnp.ones(3, bool))
-    found = poses_from_matches(make_cloud(source), make_cloud(target), matches, 0.05, count=1, support=3)
+    found = poses_from_matches(make_cloud(source), make_cloud(target), matches, 0.05, seeds=1, count=1, support=3)
     np.testing.assert_allclose(found.rotation[0], _TURN, atol=1e-5)
+
+
+def _two_motions(second: np.ndarray, shift: float) -> tuple:
+    """Matches of which the first 60 follow one motion and the other 40 a second one."""
+    source, target, row, rotation, translation = _problem(0, wrong=0)
+    target[row[60:]] = source[60:] @ (second @ rotation).T.astype(np.float32) + translation + np.float32(shift)
+    return source, target.astype(np.float32), row, rotation, second @ rotation
+
+
+@pytest.mark.parametrize(("degrees", "shift"), [(90.0, 0.0), (30.0, 0.0), (0.0, 1.0)])
+def test_hypotheses_are_all_motions_that_matches_follow_and_each_one_once(degrees, shift):
+    second = Rotation.from_rotvec([0.0, 0.0, np.deg2rad(degrees)]).as_matrix()
+    source, target, row, *rotations = _two_motions(second, shift)
+    clouds = make_cloud(source), make_cloud(target)
+    found = poses_from_matches(*clouds, Matches(row, jnp.asarray(_ALL)), 0.05, seeds=_COUNT, count=2, support=8)
+    np.testing.assert_allclose(found.rotation, rotations, atol=1e-4)
+
+
+def test_where_matches_follow_one_motion_all_hypotheses_are_that_one():
+    source, target, row, rotation, _ = _problem(0, wrong=0)
+    clouds = make_cloud(source), make_cloud(target)
+    found = poses_from_matches(*clouds, Matches(row, jnp.asarray(_ALL)), 0.05, seeds=_COUNT, count=4, support=8)
+    np.testing.assert_allclose(found.rotation, np.tile(rotation, (4, 1, 1)), atol=1e-4)
 
 
 def test_vmap_agrees_with_a_loop():

@@ -81,7 +81,7 @@ def find_alternatives(source: Samples, target: Samples, transform: Rigid) -> Alt
     turns = _best_turns(_rate(clouds, _NEAR * _coarse_spacing(source, target, _FIELD)))
     refined = _refine(turns, clouds, _coarse_spacing(source, target, _FEW))
     significance = _compare(refined, clouds, coarser(source, target))
-    rows, distinct = _distinct(refined.rotation, significance)
+    rows, distinct = _distinct(refined, significance)
     best = jax.tree.map(lambda leaf: leaf[rows], refined)
     there = rigid.inverse(into)
     poses = jax.vmap(lambda turn: rigid.compose(there, rigid.compose(turn, rigid.compose(into, transform))))(best)
@@ -200,10 +200,10 @@ def _compare(turns: Rigid, clouds: tuple[Cloud, Cloud], spacing: Array) -> Array
     return jnp.clip(jnp.max(jax.vmap(in_errors)(spacing * jnp.array(_SEEN, spacing.dtype)), axis=0), -_MOST, _MOST)
 
 
-def _distinct(rotations: Array, significance: Array) -> tuple[Array, Array]:
-    """The rows (``KEPT``,) of the best rotations, none within 20° of another or of none, and whether there is."""
-    usable = rigid.rotation_angle(rotations, jnp.eye(3)) > jnp.deg2rad(_SAME)
-    return rigid.distinct(rotations, jnp.where(usable, -significance, -jnp.inf), count=KEPT, apart=_SAME)
+def _distinct(poses: Rigid, significance: Array) -> tuple[Array, Array]:
+    """The rows (``KEPT``,) of the best poses, none turned within 20° of another or of none, and whether there is."""
+    usable = rigid.rotation_angle(poses.rotation, jnp.eye(3)) > jnp.deg2rad(_SAME)
+    return rigid.distinct(poses, jnp.where(usable, -significance, -jnp.inf), count=KEPT, apart=_SAME)
 
 
 def _rotations_evenly(count: int) -> np.ndarray:

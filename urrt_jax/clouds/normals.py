@@ -9,6 +9,7 @@ from urrt_jax.rigid import cross
 
 _AT_ONCE = 128  # points whose neighbourhoods are summed at once
 _FAR = 1e18  # radii; its square is still a float32 number
+_REACH, _GAIN = 1.5, 2.0  # in radii, of the neighbours that vote; and the growth of signs that agree, up to ±1
 _HIGHEST = jax.lax.Precision.HIGHEST
 _SINGULAR = 2e-3  # what rounding, of which arccos makes its root, leaves of a cross product that should vanish
 
@@ -31,6 +32,31 @@ def normals(points: Array, cloud: Cloud, radius: Array | float, centre: Array) -
     normal = jax.vmap(least_axis)(_spreads(points, cloud, radius))
     inward = jnp.sum(normal * (points - centre), axis=-1, keepdims=True) < 0
     return jnp.where(inward, -normal, normal)
+
+
+def face_alike(normals: Array, cloud: Cloud, radius: Array | float, *, steps: Array | int) -> Array:
+    """The normals (N, 3) of a cloud's N points, turned around where that makes them agree with their neighbours'.
+
+    Each sign becomes, step by step, what the neighbours say of it, by how near they are and how nearly parallel their
+    normals. So normals of a patch face alike; a patch as a whole may still be the wrong way around. Memory is O(N²).
+
+    Args:
+      normals: unit vectors; where they point away from the cloud's centroid is what the iteration begins with.
+      cloud: the points.
+      radius: within which neighbours count most.
+      steps: how often they are asked; 0 leaves normals pointing away from the origin.
+    """
+    squared = jnp.sum((cloud.points[:, None] - cloud.points) ** 2, axis=-1)
+    near = cloud.mask & (squared > 0)
+    parallel = jnp.matmul(normals, normals.T, precision=_HIGHEST) ** 3
+    votes = jnp.where(near, jnp.exp(-squared / (_REACH * radius) ** 2) * parallel, 0.0)
+    votes = votes / jnp.maximum(jnp.sum(jnp.abs(votes), axis=1, keepdims=True), 1e-9)
+    outward = jnp.sum(normals * cloud.points, axis=1)
+    typical = jnp.sum(jnp.where(cloud.mask, jnp.abs(outward), 0.0)) / jnp.maximum(jnp.sum(cloud.mask), 1)
+    outward = outward / jnp.maximum(typical, 1e-9)
+    begin = jnp.clip(outward, -1.0, 1.0)
+    signs = jax.lax.fori_loop(0, steps, lambda _, signs: jnp.clip(_GAIN * votes @ signs, -1.0, 1.0), begin)
+    return jnp.where(signs[:, None] < 0, -normals, normals)
 
 
 def _spreads(points: Array, cloud: Cloud, radius: Array) -> Array:

@@ -17,7 +17,7 @@ LEAST_OVERLAP = 0.4
 
 
 def load_scan_pairs(
-    path: str | Path, *, reach: float = 3e-3, least_overlap: float = LEAST_OVERLAP
+    path: str | Path, *, reach: float = 3e-3, least_overlap: float = LEAST_OVERLAP, below_overlap: float = np.inf
 ) -> tuple[list[Trial], list[dict]]:
     """All ordered pairs of scans that overlap enough, and what each is: names, overlap and true rotation in degrees.
 
@@ -27,7 +27,8 @@ def load_scan_pairs(
     Args:
       path: a ``.npz`` with ``names`` (S,), ``pose_to_world`` (S, 4, 4), world = R p + t, and ``pts_<name>`` (N, 3).
       reach: in the scans' unit (the default is 3 mm for metres).
-      least_overlap: pairs below are left out.
+      least_overlap: pairs that overlap by less are left out.
+      below_overlap: pairs that overlap by this or more are left out.
 
     Raises:
       ValueError: the file is missing or holds something else, or no pair overlaps enough.
@@ -50,7 +51,7 @@ def load_scan_pairs(
     overlaps = _cached_overlaps(hashlib.sha256(content + str(reach).encode()).hexdigest()[:16], clouds, poses, reach)
     trials, about = [], []
     for i, j in itertools.permutations(range(len(names)), 2):
-        if overlaps[i, j] < least_overlap:
+        if not least_overlap <= overlaps[i, j] < below_overlap:
             continue
         truth = np.linalg.inv(poses[j]) @ poses[i]
         scale = max(float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (clouds[i], clouds[j]))
@@ -66,7 +67,8 @@ def load_scan_pairs(
             }
         )
     if not trials:
-        raise ValueError(f"{path}: no pair of the {len(names)} scans overlaps by {least_overlap} or more")
+        asked = f"{least_overlap} or more" + (f" but less than {below_overlap}" if below_overlap < np.inf else "")
+        raise ValueError(f"{path}: no pair of the {len(names)} scans overlaps by {asked}")
     return trials, about
 
 

@@ -5,7 +5,7 @@ that both clouds hold are known again.
 """
 
 from urrt_jax.features.constellations import Constellations, constellations
-from urrt_jax.features.fpfh import fpfh
+from urrt_jax.features.fpfh import fpfh, turned_around
 from urrt_jax.features.moments import moment_invariants
 
-__all__ = ["Constellations", "constellations", "fpfh", "moment_invariants"]
+__all__ = ["Constellations", "constellations", "fpfh", "moment_invariants", "turned_around"]

@@ -41,6 +41,12 @@ def fpfh(cloud: Cloud, normals: Array, radius: Array | float, *, batch_size: int
     return jnp.where(cloud.mask[:, None] & (length > 0), features / jnp.maximum(length, 1e-9), 0.0)
 
 
+def turned_around(features: Array) -> Array:
+    """The features (N, 33) of the same points, all normals turned around: two of the three histograms are mirrored."""
+    across, towards, turn = jnp.split(features, 3, axis=-1)
+    return jnp.concatenate([across, towards[:, ::-1], turn[:, ::-1]], axis=-1)
+
+
 def _simple(points: Array, normals: Array) -> Array:
     """The simplified histograms (N, 33): a loop over the neighbours, for all points at once."""
     count = points.shape[0]

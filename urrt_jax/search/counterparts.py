@@ -35,7 +35,7 @@ def find_counterparts(source: Constellations, target: Constellations) -> Known:
     unit = jnp.minimum(source.spacing, target.spacing)
     matches = match_constellations(source, target)
     support = min(_SUPPORT, len(matches.row))
-    best = poses_from_matches(source.cloud, target.cloud, matches, _COINCIDE * unit, count=1, support=support)
+    best = poses_from_matches(source.cloud, target.cloud, matches, _COINCIDE * unit, seeds=1, count=1, support=support)
     best = jax.tree.map(lambda leaf: leaf[0], best)
     offsets = rigid.apply(best, source.cloud.points) - target.cloud.points[matches.row]
     there = matches.mutual & (jnp.sum(offsets**2, axis=-1) < (_COINCIDE * unit) ** 2)

@@ -19,20 +19,23 @@ from jax import Array
 
 from urrt_jax import rigid
 from urrt_jax.assessment import agreement, confidence_of_samples, find_alternatives, fit_samples
-from urrt_jax.clouds import Cloud, first, normals, subsample
-from urrt_jax.features import fpfh
+from urrt_jax.clouds import Cloud, face_alike, first, normals, subsample
+from urrt_jax.features import fpfh, turned_around
 from urrt_jax.model.network import Model, propose
 from urrt_jax.neighbors import coarser_spacing
 from urrt_jax.prepared import Samples, coarser
 from urrt_jax.refine.icp import anneal
 from urrt_jax.rigid import Rigid
 from urrt_jax.search.config import Search
-from urrt_jax.search.matches import match_features, poses_from_matches
+from urrt_jax.search.matches import match_most_similar, poses_from_matches
 
 _COARSE_POINTS = 256  # the first points of a farthest-point sample are a coarser one
 _BRIEF_STEPS, _STEPS = 8, 30
 _NEARLY = 1.5  # inlier distances that a pose may be off before it is refined on the whole subsample
 _QUICK_MATCHES, _QUICK_TRIED = 32, 16  # hypotheses of the quick look, and those of them that are briefly refined
+_RADII = (1.0, 0.6)  # of features, as shares of the search's radius; sparse clouds have those of the first alone
+_VOTES = 16  # steps in which neighbours' normals are made to agree
+_SEEDS = 4  # poses from matches for each hypothesis that is kept of them
 _ALIKE = 5.0  # degrees between poses that are the same
 _CHEAPER = 0.1  # what turns cost dense clouds, which tell nearly symmetric poses apart better than sparse ones do
 _UNANIMOUSLY = 0.5  # of the confidence that settles it, where most of the hypotheses that were kept end in one pose
@@ -73,7 +76,7 @@ def search_quickly(search: Search, source: Samples, target: Samples, plain: Foun
     source, target, plain = jax.lax.stop_gradient((source, target, plain))
     few, search = (source.even, target.even), _cheaper(search, jnp.array(True))
     width = coarser(source, target)
-    guesses = _from_features((source, target), few, width, search, _QUICK_MATCHES)
+    guesses = _from_features((source, target), few, width, search, _QUICK_MATCHES, jnp.array(True))
     found, unanimous = _choose([guesses], few, width, plain.transform, search, _QUICK_TRIED)
     score = fit_samples(*few, found.transform, width).score
     confidence = confidence_of_samples(score, find_alternatives(source, target, found.transform))
@@ -98,7 +101,7 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     dense = jnp.minimum(*(jnp.sum(each.thinned.mask) for each in (source, target))) >= DENSE
     width, search, guesses = coarser_spacing(*few), _cheaper(search, dense), []
     if search.matches:
-        guesses.append(_from_features((source, target), few, width, search, search.matches))
+        guesses.append(_from_features((source, target), few, width, search, search.matches, dense))
     if search.landmarks:
         seen = first(source.even, model.config.points), first(target.even, model.config.points)
         guesses.append(propose(model, *seen, search.landmarks))
@@ -161,7 +164,7 @@ def _finalists(found: Rigid, poses: Rigid, scores: Array, search: Search) -> Rig
     """
     far = rigid.rotation_angle(poses.rotation, found.rotation) > jnp.deg2rad(_APART)
     scores = jnp.where(far & _worth(poses, scores, search)[1], scores, -jnp.inf)
-    rows, there = rigid.distinct(poses.rotation, scores, count=FINALISTS - 1, apart=_APART)
+    rows, there = rigid.distinct(poses, scores, count=FINALISTS - 1, apart=_APART)
     others = jax.vmap(lambda row, is_there: rigid.choose(is_there, jax.tree.map(lambda leaf: leaf[row], poses), found))
     return jax.tree.map(lambda own, leaf: jnp.concatenate([own[None], leaf]), found, others(rows, there))
 
@@ -196,16 +199,43 @@ def _cheaper(search: Search, dense: Array) -> Search:
 
 
 def _from_features(
-    samples: tuple[Samples, Samples], few: tuple[Cloud, Cloud], width: Array, search: Search, matches: int
+    samples: tuple[Samples, Samples], few: tuple[Cloud, Cloud], width: Array, search: Search, matches: int, dense: Array
 ) -> Rigid:
-    def describe(side: tuple[Cloud, Cloud]) -> Array:
-        part, dense = side
-        # The clouds are centred: normals point away from the origin.
-        surface = normals(part.points, dense, search.normal_radius * width, jnp.zeros(3, part.points.dtype))
-        return fpfh(part, surface, search.feature_radius * width)
+    """Hypotheses from matched features of ``few``, even samples of the clouds that ``samples`` stand for."""
+    matched = match_most_similar(_similarity(samples, few, width, search, dense), *(part.mask for part in few))
+    rows = few[0].points.shape[0]
+    count, seeds, support = (min(each, rows) for each in (matches, _SEEDS * matches, search.support))
+    distance = search.match_distance * width
+    return poses_from_matches(*few, matched, distance, seeds=seeds, count=count, support=support)
 
-    sides = [(part, each.thinned) for part, each in zip(few, samples, strict=True)]
-    features = jax.lax.map(describe, jax.tree.map(lambda *leaves: jnp.stack(leaves), *sides))
-    matched = match_features(*features, *(part.mask for part in few))
-    count, support = (min(each, few[0].points.shape[0]) for each in (matches, search.support))
-    return poses_from_matches(*few, matched, search.match_distance * width, count=count, support=support)
+
+def _similarity(
+    samples: tuple[Samples, Samples], few: tuple[Cloud, Cloud], width: Array, search: Search, dense: Array
+) -> Array:
+    """How similar the surroundings are of the N points of both samples, (N, N).
+
+    Dense clouds are scans as a rule, open surfaces that overlap in part. Not all of their normals point away from the
+    centroid. So neighbours' normals are made to agree, and as a patch may then be the wrong way around as a whole,
+    features are compared both ways around. And near the rim of what overlaps only small neighbourhoods are whole. So
+    there are two sizes of them.
+    """
+    wholes = tuple(each.thinned for each in samples)
+    clouds, wholes = (jax.tree.map(lambda *each: jnp.stack(each), *both) for both in (few, wholes))
+
+    def orient(side: tuple[Cloud, Cloud]) -> Array:
+        part, whole = side
+        # The clouds are centred: normals point away from the origin.
+        surface = normals(part.points, whole, search.normal_radius * width, jnp.zeros(3, part.points.dtype))
+        return face_alike(surface, part, width, steps=jnp.where(dense, _VOTES, 0))
+
+    surfaces = jax.lax.map(orient, (clouds, wholes))
+
+    def add(step: Array, similarities: Array) -> Array:
+        radius = jnp.array(_RADII, width.dtype)[step] * search.feature_radius * width
+        source, target = jax.lax.map(lambda side: fpfh(side[0], side[1], radius), (clouds, surfaces))
+        return similarities + jnp.stack([source @ target.T, source @ turned_around(target).T])
+
+    rows = few[0].points.shape[0]
+    sizes = jnp.where(dense, len(_RADII), 1)
+    alike, turned = jax.lax.fori_loop(0, sizes, add, jnp.zeros((2, rows, rows), width.dtype))
+    return jnp.where(dense, jnp.maximum(alike, turned), alike)

@@ -287,6 +287,7 @@ PART = 'title = "x"\nmethods = []\n[[parts]]\ntitle = "y"\nprotocol = "dcp"\n'
         ('title = "x"\nmethods = ["nobody"]\nparts = []', "method: expected one of"),
         (PART + 'columns = ["mse"]', "columns: expected"),
         (PART + "stride = 0", "stride"),
+        (PART + "overlap = [0.4, 0.2]", "overlap"),
         (PART + "[parts.published]\nA = [1]", "published"),
     ],
 )
