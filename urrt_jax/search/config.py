@@ -28,7 +28,8 @@ class Search:
     Attributes:
       points: points of each cloud's subsample in the thorough search.
       normal_radius: of the neighbourhood of a normal.
-      feature_radius: of the neighbourhood of a feature.
+      feature_radius: of the neighbourhood of a feature. Where both clouds have 4,096 points or more, features of 0.6 of
+        it count as much.
       match_distance: two feature matches are compatible when the lengths between their ends differ by less than this; a
         match supports a pose that brings its ends closer than this.
       matches: the number of hypotheses from feature matches, at most; 0 for none.
