@@ -216,17 +216,27 @@ def test_decoders_that_regress_the_pose_do_best_without_regions():
     assert max(errors["B"]) < min(errors["C"])
 
 
-def test_regions_with_positions_help_on_partial_pairs_and_regions_without_do_not():
+def _share_of_a(name: str, protocols: tuple[str, ...]) -> tuple[float, float, float]:
+    """A model's error as a share of that of the model without regions, after equal time, and its interval."""
     rows = json.loads((HERE / "ablation/equal_time.json").read_text())["rows"]
-    grouped = {name: [row for row in rows if row["model"] == name] for name in equal_time.MODELS}
+    grouped = {each: [row for row in rows if row["model"] == each] for each in equal_time.MODELS}
+    assert {len(some) for some in grouped.values()} == {3}
+    return equal_time.ratio(grouped[name], grouped[equal_time.BASES[name]], protocols)
 
-    def share(name: str) -> tuple[float, float, float]:
-        return equal_time.ratio(grouped[name], grouped[equal_time.BASES[name]], equal_time.PARTIAL)
 
-    found, _, high = share("C, places, landmarks")
+def test_landmarks_of_regions_with_positions_help_on_partial_pairs_and_those_without_do_not():
+    found, _, high = _share_of_a("C, places, landmarks", equal_time.PARTIAL)
     assert 0.75 < found < 0.87 and high < 1
-    for name in ("B, parts, landmarks", "C, places, pose"):
-        assert share(name)[0] > 1
+    assert _share_of_a("B, parts, landmarks", equal_time.PARTIAL)[0] > 1
+
+
+def test_poses_of_regions_do_not_help_on_partial_pairs_but_among_stray_points():
+    assert 1 < _share_of_a("C, places, pose", equal_time.PARTIAL)[0] < 1.1
+    for name in ("B, parts, pose", "C, parts, pose"):
+        _, low, high = _share_of_a(name, equal_time.PARTIAL)
+        assert low < 1 < high
+    for name in ("B, parts, pose", "C, places, pose", "C, parts, pose"):
+        assert _share_of_a(name, ("outliers",))[2] < 1
 
 
 def test_nearest_neighbours_are_exact():
