@@ -98,7 +98,7 @@ def rotation_angle(first: Array, second: Array) -> Array:
 
 
 def distinct(
-    poses: Rigid, worth: Array, *, count: int, apart: float, shift: Array | float = jnp.inf
+    poses: Rigid, worth: Array, *, count: int, apart: float, shift: Array | float | None = None
 ) -> tuple[Array, Array]:
     """The rows (count,) of the best of N poses, best first, and whether there is one, (count,).
 
@@ -112,6 +112,8 @@ def distinct(
 
     def same(one: Rigid) -> Array:
         turned = rotation_angle(one.rotation, poses.rotation) < jnp.deg2rad(apart)
+        if shift is None:
+            return turned
         return turned & (jnp.linalg.norm(one.translation - poses.translation, axis=-1) < shift)
 
     alike = jax.vmap(same)(poses)

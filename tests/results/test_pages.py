@@ -91,6 +91,12 @@ def _beyond(protocol: str, method: str, name: str, place: int = 0) -> float:
     return _figure("beyond", protocol, method, name, place)
 
 
+def _best_of_peers(protocol: str, name: str) -> float:
+    """The best figure of other methods on the pairs that hardly overlap."""
+    peers = ("scan_icp", "scan_fgr", "scan_ransac", "scan_kiss")
+    return max(_figure("default_call", protocol, peer, name, 1) for peer in peers)
+
+
 def _lost(name: str) -> float:
     """The most that recall loses on categories that training never saw, in any protocol."""
     rows = [measured(part) for part in load("unseen")["parts"]]
@@ -187,7 +193,7 @@ RESULTS = (
     f"finds {_beyond('scans', 'plain', 'recall_2deg_0.02'):.3f} of the scans within 2° in the table above, and "
     f"{_figure('default_call', 'scans', 'plain', 'recall_2deg_0.02'):.3f} in the later",
     f"The default call finds {_figure('default_call', 'scans', 'register', 'recall_5deg_0.05', 1):.3f} of them, "
-    f"and the best peer {_figure('default_call', 'scans', 'scan_ransac', 'recall_5deg_0.05', 1):.3f}",
+    f"and the best peer {_best_of_peers('scans', 'recall_5deg_0.05'):.3f}",
     f"{_range('beyond_5', _SIZES)} % are more than 5° wrong",
     f"{_range('beyond_45', [row for row in _SIZES if row['pairs_of'] != '2048 points'])} % are more than 45° wrong",
     f"at least {int(100 * min(row['right_asymmetric_called'] for row in _SIZES[3:]))} % of the right poses",

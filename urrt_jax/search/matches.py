@@ -44,7 +44,7 @@ def poses_from_matches(
     usable = matches.mutual[:, None] & matches.mutual & ~jnp.eye(len(ends), dtype=bool)
     agree = (usable & (jnp.abs(lengths[0] - lengths[1]) < distance)).astype(jnp.float32)
     common = (agree @ agree) * agree
-    _, first_rows = jax.lax.top_k(jnp.sum(common, axis=1), seeds)
+    _, starts = jax.lax.top_k(jnp.sum(common, axis=1), seeds)
 
     def agreeing(pose: Rigid) -> Array:
         offset = jnp.sum((rigid.apply(pose, source.points) - ends) ** 2, axis=-1)
@@ -59,7 +59,7 @@ def poses_from_matches(
         better = rigid.choose(jnp.sum(inlier) >= 3, second, first)
         return better, jnp.sum(agreeing(better))
 
-    poses, number = jax.vmap(pose)(first_rows)
+    poses, number = jax.vmap(pose)(starts)
     if count == seeds:
         return poses
     # Where there are fewer poses that differ, the best one stands for those that are wanting.

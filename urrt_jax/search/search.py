@@ -21,6 +21,7 @@ from urrt_jax import rigid
 from urrt_jax.assessment import agreement, confidence_of_samples, find_alternatives, fit_samples
 from urrt_jax.clouds import Cloud, face_alike, first, normals, subsample
 from urrt_jax.features import fpfh, turned_around
+from urrt_jax.loops import only_if
 from urrt_jax.model.network import Model, propose
 from urrt_jax.neighbors import coarser_spacing
 from urrt_jax.prepared import Samples, coarser
@@ -226,7 +227,7 @@ def _similarity(
         part, whole = side
         # The clouds are centred: normals point away from the origin.
         surface = normals(part.points, whole, search.normal_radius * width, jnp.zeros(3, part.points.dtype))
-        return face_alike(surface, part, width, steps=jnp.where(dense, _VOTES, 0))
+        return only_if(dense, lambda: face_alike(surface, part, width, steps=_VOTES), surface)
 
     surfaces = jax.lax.map(orient, (clouds, wholes))
 
