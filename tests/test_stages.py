@@ -22,7 +22,7 @@ from urrt_jax.stages import approach, register_in_frame, rung
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _USUAL = {"prepare", "recognise", "estimate", "approach", "settle", "compare", "assess", "label"}
-_RARE = {"search_quickly", "search_thoroughly", "choose_finalist", "settle_thinned", "expect"}
+_RARE = {"search_quickly", "judge_quick_look", "search_thoroughly", "choose_finalist", "settle_thinned", "expect"}
 _AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
 _SHIFT = np.array([0.4, -0.2, 0.7])
 
@@ -178,6 +178,7 @@ def compiled(monkeypatch):
     return keys
 
 
+_SEARCH = {"search_quickly", "judge_quick_look", "search_thoroughly", "choose_finalist"}  # of dense clouds
 _LARGE = {"settle_thinned"}  # of more than 4,096 points, which nearly all pairs of such rungs have
 
 
@@ -186,9 +187,9 @@ _LARGE = {"settle_thinned"}  # of more than 4,096 points, which nearly all pairs
     [
         (256, False, _USUAL),
         (256, True, _USUAL | {"search_thoroughly", "expect"}),
-        (4096, True, _USUAL | {"search_quickly", "search_thoroughly", "choose_finalist"}),
+        (4096, True, _USUAL | _SEARCH),
         (16_384, False, _USUAL | _LARGE),
-        (16_384, True, _USUAL | _LARGE | {"search_quickly", "search_thoroughly", "choose_finalist"}),
+        (16_384, True, _USUAL | _LARGE | _SEARCH),
     ],
 )
 def test_what_is_compiled_ahead_on_a_rung(compiled, small_model, size, rare, expected):
@@ -196,14 +197,25 @@ def test_what_is_compiled_ahead_on_a_rung(compiled, small_model, size, rare, exp
     assert set(compiled.values()) == expected
 
 
-def test_clouds_of_50_to_a_million_points_take_41_programs(compiled, small_model):
+def test_clouds_of_50_to_a_million_points_take_42_programs(compiled, small_model):
     """Seven rungs, of which four are of large clouds and two of small ones; all other stages are compiled once."""
     options = make_options(small_model, ICP(), "auto")
     for size in sorted({rung(int(count)) for count in np.geomspace(50, 1_000_000, 1000)}):
         register_in_frame(options, *abstract_pair(size), rare=True)
     on_rungs = dict.fromkeys(("prepare", "settle", "assess", "label"), 7) | {"settle_thinned": 4, "expect": 2}
-    once = ("recognise", "estimate", "approach", "search_quickly", "search_thoroughly", "choose_finalist", "compare")
+    once = {"recognise", "estimate", "approach", "compare"} | _SEARCH
     assert collections.Counter(compiled.values()) == on_rungs | dict.fromkeys(once, 1)
+
+
+@pytest.mark.parametrize(("size", "refined_by"), [(4096, {"settle"}), (16_384, {"settle_thinned"})])
+def test_finalists_of_large_clouds_are_compared_before_the_last_refinement(compiled, small_model, size, refined_by):
+    """Which takes most of the time, the more so from a wrong pose."""
+    source, target, told = abstract_pair(size)
+    sizes = stages.sizes_of(make_options(small_model, ICP(), "auto"))
+    clouds = stages.prepare(sizes, source), stages.prepare(sizes, target)
+    found = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), _found([np.eye(3)] * 3))
+    stages._verified((ICP(), Search()), *clouds, found, told)
+    assert set(compiled.values()) == {"prepare", "compare", "assess", "choose_finalist"} | refined_by
 
 
 def test_rare_stages_are_compiled_for_the_first_pair_that_needs_them(monkeypatch, call, clean, sparse, hard):
@@ -220,15 +232,19 @@ def test_rare_stages_are_compiled_for_the_first_pair_that_needs_them(monkeypatch
     assert names() == _USUAL | {"expect", "search_thoroughly"}
 
 
+def _found(turns: list[np.ndarray]) -> Found:
+    """What a thorough search has found whose finalists have these turns."""
+    poses = rigid.Rigid(np.stack(turns).astype(np.float32), np.zeros((len(turns), 3), np.float32))
+    first = jax.tree.map(lambda leaf: leaf[0], poses)
+    return Found(first, np.float32(0.9), np.float32(0.3), np.bool_(True), poses)
+
+
 def _verified(source: np.ndarray, target: np.ndarray, turns: list[np.ndarray], search: Search, verify=stages._verified):
     """The finalist that is kept of two clouds of one size, centred, of those with these turns."""
     options = make_options(None, ICP(), "auto")
     *clouds, told = PairOnHost(source, target.astype(np.float32), None, None, None, None).padded(256)
     prepared = (stages.prepare(stages.sizes_of(options), each) for each in clouds)
-    poses = rigid.Rigid(np.stack(turns).astype(np.float32), np.zeros((len(turns), 3), np.float32))
-    first = jax.tree.map(lambda leaf: leaf[0], poses)
-    found = Found(first, np.float32(0.9), np.float32(0.3), np.bool_(True), poses)
-    return verify((ICP(), search), *prepared, found, told)
+    return verify((ICP(), search), *prepared, _found(turns), told)
 
 
 @pytest.mark.parametrize("verify", [stages._verified, jax.jit(stages._verified)], ids=["arrays", "traced"])

@@ -14,10 +14,11 @@ A registration takes these steps. Each one after the first is a *stage*: a progr
    initial transform takes its place where it fits better.
 5. **Approach** (``approach``). Robust point-to-point ICP on the samples gives the *plain pose*. It calls for a search
    where the samples do not fit in it, or not well enough for how far it turns.
-6. **Search** (``search_quickly`` for dense clouds, ``search_thoroughly``, ``choose_finalist``; rare). Matched FPFH
-   features and the network's landmarks propose hypotheses. The best are refined, and the best of these is kept. Of
-   dense clouds three finalists go through stages 7 to 9, and the one in which the whole clouds then fit best is kept.
-   Nothing is random.
+6. **Search** (rare; ``search_thoroughly``). Matched FPFH features and the network's landmarks propose hypotheses. The
+   best are refined, and the best of these is kept. Dense clouds get a quick look first (``search_quickly``), whose
+   pose stage 8 compares with others (``judge_quick_look``). Where that does not settle it, three finalists of the
+   thorough search are refined and assessed by stages 7 and 9, large clouds thinned only, and the one in which the
+   whole clouds then fit best is kept (``choose_finalist``). Nothing is random.
 7. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
    directions, among the full clouds, mostly point to plane. The bandwidth of its weights shrinks to the spacing, and
    then to the spread of the distances themselves, so that points without a counterpart do not pull. Small clouds whose
@@ -357,6 +358,7 @@ def label(_: None, cloud: Prepared, seen: Seen) -> Array:
 
 prepare = Program(prepared.prepare)
 search_quickly = Program(search.search_quickly)
+judge_quick_look = Program(search.judge_quick_look)
 search_thoroughly = Program(search.search_thoroughly)
 choose_finalist = Program(search.choose_finalist)
 settle_thinned = Program(refine.settle_thinned)
@@ -425,7 +427,7 @@ def register_in_frame(
         asked = refiner, always, preference
         found, quick, thin_first = call(approach, asked, *samples, counts, known, start.transform)
         if searching is not None:
-            found = when(quick, search_quickly, (searching, *samples, found), found, least=search.DENSE)
+            found = when(quick, _look_quickly, (searching, *samples, found), found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
             if how is not None:
                 asked = (how, searching), *clouds, found, told
@@ -453,19 +455,26 @@ def register_in_frame(
     )
 
 
+def _look_quickly(searching: Search, source: Samples, target: Samples, plain: Found) -> Found:
+    """The best pose of a quick look at dense clouds, and whether that settles it: a stage of other stages."""
+    found, unanimous = search_quickly(searching, source, target, plain)
+    others = compare(None, source, target, found.transform)
+    return judge_quick_look(searching, found, unanimous, others)
+
+
 def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, found: Found, told: Told) -> Found:
     """The finalist in which dense clouds fit best, once all have been refined: a stage of other stages."""
     refiner, searching = options
 
     def judged(pose: Rigid) -> tuple[Rigid, Array]:
-        """Where refinement of a pose ends, and how well the clouds fit there."""
-        width = found.width
+        """Where refinement of a pose ends, of large clouds that of thinned ones, and how well the clouds fit there."""
         if source.cloud.mask.shape[-1] > THINNED:
-            pose, width = settle_thinned(refiner, source, target, pose, width)
-        end = settle(refiner, source, target, pose, width)
-        others = compare(None, source.samples, target.samples, end.transform)
-        assessment = assess(True, source, target, end.transform, end.converged, others, told)
-        return end.transform, assessment.score
+            end, _ = settle_thinned(refiner, source, target, pose, found.width)
+        else:
+            end = settle(refiner, source, target, pose, found.width).transform
+        others = compare(None, source.samples, target.samples, end)
+        assessment = assess(True, source, target, end, np.bool_(True), others, told)
+        return end, assessment.score
 
     mode = _mode(source, target, found)
     if mode == "traced":

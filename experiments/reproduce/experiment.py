@@ -166,7 +166,11 @@ def _check(experiment: Experiment) -> None:
         if each.stride < 1 or each.points < 1:
             raise ValueError(f"stride and points: expected at least 1, got {each.stride} and {each.points}")
     for part in experiment.parts:
-        if len(part.overlap) != 2 or not 0 <= part.overlap[0] < part.overlap[1]:
+        try:
+            least, below = map(float, part.overlap)
+        except (TypeError, ValueError):
+            least, below = np.nan, np.nan
+        if not 0 <= least < below:
             raise ValueError(f"overlap: expected the least, and a larger one that is too much, got {part.overlap}")
         if part.first is not None and part.first < 1:
             raise ValueError(f"first: expected at least 1, got {part.first}")

@@ -4,6 +4,7 @@ Almost all tests run the same compiled stages: clouds are padded to the first ru
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from urrt_jax import load_model, register, rigid, stages
-from urrt_jax.assessment import agreement
+from urrt_jax.assessment import Alternatives, agreement, confidence_of_samples
 from urrt_jax.clouds import make_cloud
 from urrt_jax.frames import normalize_pair
 from urrt_jax.model.network import estimate, propose
@@ -20,7 +21,7 @@ from urrt_jax.prepared import Sizes, coarser
 from urrt_jax.refine import ICP
 from urrt_jax.rigid import Known
 from urrt_jax.search import Found, Search
-from urrt_jax.search.search import DENSE, FINALISTS, _finalists, search_thoroughly
+from urrt_jax.search.search import DENSE, FINALISTS, _finalists, _similarity, search_thoroughly
 
 _SMALL = Search(points=128, matches=16, landmarks=0, tried=16)
 _SIZE = 256
@@ -80,7 +81,7 @@ def look():
 
     def look_quickly(source, target, **options) -> Found:
         config = dataclasses.replace(_SMALL, **options)
-        return stages.search_quickly(config, *_samples(_pad(source), _pad(target)), _plain())
+        return stages._look_quickly(config, *_samples(_pad(source), _pad(target)), _plain())
 
     return look_quickly
 
@@ -293,6 +294,27 @@ def test_finalists_are_the_best_poses_that_are_far_from_each_other():
     np.testing.assert_array_equal(dear.rotation, turns[[0, 3, 5]])
 
 
+@pytest.mark.parametrize(("dense", "least", "most"), [(True, 0.95, 1.0), (False, 0.0, 0.3)])
+def test_points_of_dense_surfaces_are_alike_whichever_way_their_normals_point(dense, least, most):
+    """Normals point away from the origin, so that those of the lower patch are turned around."""
+    place = np.random.default_rng(0).uniform(-1, 1, (_SIZE, 2))
+    bumps = 0.2 * np.sin(3 * place[:, 0]) * np.cos(2 * place[:, 1] + 1) + 0.1 * np.sin(5 * place[:, 1])
+    above, below = (np.c_[place, bumps + height].astype(np.float32) for height in (2, -2))
+    clouds = tuple(make_cloud(each, np.ones(_SIZE, bool)) for each in (above, below))
+    samples = tuple(SimpleNamespace(thinned=each) for each in clouds)
+    alike = _similarity(samples, clouds, jnp.array(0.1), Search(), jnp.array(dense))
+    found = jnp.mean(jnp.argmax(alike, axis=1) == jnp.arange(_SIZE))
+    assert least <= float(found) <= most
+
+
+@pytest.mark.parametrize(("dense", "sizes"), [(True, 2), (False, 1)])
+def test_points_of_dense_clouds_are_compared_by_neighborhoods_of_two_sizes(cloud, dense, sizes):
+    """A point and itself have a similarity of one for each size."""
+    one = make_cloud(*_pad(cloud))
+    alike = _similarity((SimpleNamespace(thinned=one),) * 2, (one, one), jnp.array(0.2), Search(), jnp.array(dense))
+    np.testing.assert_allclose(jnp.diagonal(alike)[: len(cloud)], sizes, atol=1e-4)
+
+
 @pytest.mark.parametrize(("dense", "pending"), [(DENSE, False), (100, True)])
 def test_what_a_thorough_search_of_dense_clouds_finds_is_still_to_be_verified(
     small_model, cloud, monkeypatch, dense, pending
@@ -311,6 +333,16 @@ def test_a_quick_look_finds_any_turn_at_partial_overlap(look, partial, degrees):
 @pytest.mark.parametrize(("sure", "pending"), [(1e-6, False), (10.0, True)])
 def test_a_quick_look_calls_for_the_thorough_search_where_it_is_not_sure(look, partial, sure, pending):
     assert bool(look(*partial(120), sure=sure).pending) == pending
+
+
+@pytest.mark.parametrize(
+    ("asked", "unanimous", "pending"), [(0.9, False, False), (1.1, False, True), (1.9, True, False), (2.1, True, True)]
+)
+def test_half_the_confidence_settles_a_quick_look_in_which_most_hypotheses_agree(asked, unanimous, pending):
+    found = _plain()._replace(score=jnp.array(0.7))
+    others = Alternatives(jax.tree.map(lambda leaf: leaf[None], rigid.identity()), jnp.array([10.0]))
+    search = Search(sure=asked * float(confidence_of_samples(found.score, others)))
+    assert bool(stages.judge_quick_look(search, found, np.bool_(unanimous), others).pending) == pending
 
 
 def test_a_quick_look_at_another_shape_is_not_sure(look, cloud):

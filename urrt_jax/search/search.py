@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax import rigid
-from urrt_jax.assessment import agreement, confidence_of_samples, find_alternatives, fit_samples
+from urrt_jax.assessment import Alternatives, agreement, confidence_of_samples, fit_samples
 from urrt_jax.clouds import Cloud, face_alike, first, normals, subsample
 from urrt_jax.features import fpfh, turned_around
 from urrt_jax.loops import only_if
@@ -65,8 +65,10 @@ class Found(NamedTuple):
     finalists: Rigid
 
 
-def search_quickly(search: Search, source: Samples, target: Samples, plain: Found) -> Found:
-    """The best pose that matched features of the even samples speak for; of dense clouds, as scans are, often enough.
+def search_quickly(search: Search, source: Samples, target: Samples, plain: Found) -> tuple[Found, Array]:
+    """The best pose that matched features of the even samples speak for, and whether most good hypotheses end in it.
+
+    Of dense clouds, as scans are, that is often enough: ``judge_quick_look`` tells.
 
     Args:
       search: how to search.
@@ -78,9 +80,19 @@ def search_quickly(search: Search, source: Samples, target: Samples, plain: Foun
     few, search = (source.even, target.even), _cheaper(search, jnp.array(True))
     width = coarser(source, target)
     guesses = _from_features((source, target), few, width, search, _QUICK_MATCHES, jnp.array(True))
-    found, unanimous = _choose([guesses], few, width, plain.transform, search, _QUICK_TRIED)
-    score = fit_samples(*few, found.transform, width).score
-    confidence = confidence_of_samples(score, find_alternatives(source, target, found.transform))
+    return _choose([guesses], few, width, plain.transform, search, _QUICK_TRIED)
+
+
+def judge_quick_look(search: Search, found: Found, unanimous: Array, others: Alternatives) -> Found:
+    """What a quick look has found; ``pending`` where it is not sure enough.
+
+    Args:
+      search: how it was searched.
+      found: the best pose.
+      unanimous: (), bool, whether most of the best hypotheses ended in it.
+      others: poses that fit the samples about as well.
+    """
+    confidence = confidence_of_samples(found.score, others)
     settled = (confidence >= search.sure) | (unanimous & (confidence >= _UNANIMOUSLY * search.sure))
     return found._replace(pending=~settled)
 

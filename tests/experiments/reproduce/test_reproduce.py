@@ -288,6 +288,8 @@ PART = 'title = "x"\nmethods = []\n[[parts]]\ntitle = "y"\nprotocol = "dcp"\n'
         (PART + 'columns = ["mse"]', "columns: expected"),
         (PART + "stride = 0", "stride"),
         (PART + "overlap = [0.4, 0.2]", "overlap"),
+        (PART + "overlap = 0.2", "overlap: expected the least"),
+        (PART + 'overlap = ["some", "more"]', "overlap: expected the least"),
         (PART + "[parts.published]\nA = [1]", "published"),
     ],
 )
