@@ -16,8 +16,8 @@ A registration takes these steps. Each one after the first is a *stage*: a progr
    where the samples do not fit in it, or not well enough for how far it turns.
 6. **Search** (rare; ``search_thoroughly``). Matched FPFH features and the network's landmarks propose hypotheses. The
    best are refined, and the best of these is kept. Dense clouds get a quick look first (``search_quickly``), whose
-   pose stage 8 compares with others (``judge_quick_look``). Where that does not settle it, three finalists of the
-   thorough search are refined and assessed by stages 7 and 9, large clouds thinned only, and the one in which the
+   pose is refined, large clouds being thinned, and assessed among the whole clouds (``judge_quick_look``). Where that
+   does not settle it, three finalists of the thorough search are refined and assessed alike, and the one in which the
    whole clouds then fit best is kept (``choose_finalist``). Nothing is random.
 7. **Refine** (``settle``; large clouds first in ``settle_thinned``). Robust ICP with correspondences in both
    directions, among the full clouds, mostly point to plane. The bandwidth of its weights shrinks to the spacing, and
@@ -78,9 +78,9 @@ STEPS_BEFORE_REFINEMENT = 2
 _SMALLEST_RUNG, _FACTOR = 256, 4
 _SAMPLE = 512  # points of the even subsample, at least
 # What the plain pose is worth on the subsample (``Fit.score`` less what its turn costs), below which a search is called
-# for. Dense clouds are searched more readily, because their quick look is cheap and seldom wrong. Chosen on training
+# for. Dense clouds are searched more readily, because their quick look is cheap. Chosen on training
 # shapes and bunny pairs.
-_FITS, _FITS_DENSE = 0.78, 0.87
+_FITS, _FITS_DENSE = 0.78, 0.92
 _COARSE_GRID, _LOST_GRID = 0.1, 1.0
 """The step between float32 coordinates, in spacings, from which on lost digits explain a failure, and from which on no
 result is trusted: then neighbouring points have fallen together. Guesses."""
@@ -427,7 +427,8 @@ def register_in_frame(
         asked = refiner, always, preference
         found, quick, thin_first = call(approach, asked, *samples, counts, known, start.transform)
         if searching is not None:
-            found = when(quick, _look_quickly, (searching, *samples, found), found, least=search.DENSE)
+            asked = (refiner, searching), *clouds, found, told
+            found = when(quick, _look_quickly, asked, found, least=search.DENSE)
             found = when(found.pending, search_thoroughly, ((searching, model), *samples, found), found)
             if how is not None:
                 asked = (how, searching), *clouds, found, told
@@ -455,11 +456,12 @@ def register_in_frame(
     )
 
 
-def _look_quickly(searching: Search, source: Samples, target: Samples, plain: Found) -> Found:
+def _look_quickly(options: tuple[ICP, Search], source: Prepared, target: Prepared, plain: Found, told: Told) -> Found:
     """The best pose of a quick look at dense clouds, and whether that settles it: a stage of other stages."""
-    found, unanimous = search_quickly(searching, source, target, plain)
-    others = compare(None, source, target, found.transform)
-    return judge_quick_look(searching, found, unanimous, others)
+    refiner, searching = options
+    found, unanimous = search_quickly(searching, source.samples, target.samples, plain)
+    _, assessment = _tried(refiner, source, target, found.transform, found.width, told)
+    return judge_quick_look(searching, found, unanimous, assessment.report.confidence)
 
 
 def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, found: Found, told: Told) -> Found:
@@ -467,13 +469,7 @@ def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, f
     refiner, searching = options
 
     def judged(pose: Rigid) -> tuple[Rigid, Array]:
-        """Where refinement of a pose ends, of large clouds that of thinned ones, and how well the clouds fit there."""
-        if source.cloud.mask.shape[-1] > THINNED:
-            end, _ = settle_thinned(refiner, source, target, pose, found.width)
-        else:
-            end = settle(refiner, source, target, pose, found.width).transform
-        others = compare(None, source.samples, target.samples, end)
-        assessment = assess(True, source, target, end, np.bool_(True), others, told)
+        end, assessment = _tried(refiner, source, target, pose, found.width, told)
         return end, assessment.score
 
     mode = _mode(source, target, found)
@@ -487,6 +483,18 @@ def _verified(options: tuple[ICP, Search], source: Prepared, target: Prepared, f
         each = [judged(jax.tree.map(lambda leaf, row=row: leaf[row], found.finalists)) for row in rows]
         ends = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
     return choose_finalist(searching, found, *ends)
+
+
+def _tried(
+    refiner: ICP, source: Prepared, target: Prepared, pose: Rigid, width: Array, told: Told
+) -> tuple[Rigid, Assessment]:
+    """Where refinement of a pose of dense clouds ends, of large ones that of thinned ones, and what is said of it."""
+    if source.cloud.mask.shape[-1] > THINNED:
+        end, _ = settle_thinned(refiner, source, target, pose, width)
+    else:
+        end = settle(refiner, source, target, pose, width).transform
+    others = compare(None, source.samples, target.samples, end)
+    return end, assess(True, source, target, end, np.bool_(True), others, told)
 
 
 def _not_known(cloud: Cloud) -> Known:

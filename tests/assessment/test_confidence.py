@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from urrt_jax import rigid
-from urrt_jax.assessment import Alternatives, Fit, Precision, confidence, confidence_of_samples, measure, odds
+from urrt_jax.assessment import Alternatives, Fit, Precision, confidence, measure, odds
 from urrt_jax.assessment.confidence import CHECKS, MEASURED
 from urrt_jax.rigid import Rigid
 
@@ -82,13 +82,3 @@ def test_odds_are_even_where_both_fit_alike_and_turn_when_both_are_swapped():
     assert float(found[0] * found[2]) == pytest.approx(1)
     assert float(found[0]) > 1
     assert float(found[3]) == 0  # there is no such pose
-
-
-def test_confidence_of_samples_follows_score_and_alternatives():
-    def sure(score: float, significance: float) -> float:
-        others = Alternatives(rigid.identity(), jnp.array([significance, 10.0]))
-        return float(confidence_of_samples(jnp.float32(score), others))
-
-    assert sure(0.9, 8) > 0.9
-    assert sure(0.5, 8) < 0.1
-    assert sure(0.9, 0) < 0.2

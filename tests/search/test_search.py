@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from urrt_jax import load_model, register, rigid, stages
-from urrt_jax.assessment import Alternatives, agreement, confidence_of_samples
+from urrt_jax.assessment import agreement
 from urrt_jax.clouds import make_cloud
 from urrt_jax.frames import normalize_pair
 from urrt_jax.model.network import estimate, propose
@@ -26,6 +26,7 @@ from urrt_jax.search.search import DENSE, FINALISTS, _finalists, _similarity, se
 _SMALL = Search(points=128, matches=16, landmarks=0, tried=16)
 _SIZE = 256
 _SIZES = Sizes(sample=512, queries=ICP().points, normal_radius=ICP().normal_radius)
+_TOLD = stages.Told(np.bool_(False), np.zeros(3, np.float32), np.bool_(True), np.float32(0), np.float32(0))
 _AXIS = np.array([0.31, -0.54, 0.78]) / np.linalg.norm([0.31, -0.54, 0.78])
 _SHIFT = np.array([0.4, -0.2, 0.7])
 
@@ -81,7 +82,8 @@ def look():
 
     def look_quickly(source, target, **options) -> Found:
         config = dataclasses.replace(_SMALL, **options)
-        return stages._look_quickly(config, *_samples(_pad(source), _pad(target)), _plain())
+        clouds = (stages.prepare(_SIZES, cloud) for cloud in _normalized(_pad(source), _pad(target)))
+        return stages._look_quickly((ICP(), config), *clouds, _plain(), _TOLD)
 
     return look_quickly
 
@@ -339,15 +341,22 @@ def test_a_quick_look_calls_for_the_thorough_search_where_it_is_not_sure(look, p
     ("asked", "unanimous", "pending"), [(0.9, False, False), (1.1, False, True), (1.9, True, False), (2.1, True, True)]
 )
 def test_half_the_confidence_settles_a_quick_look_in_which_most_hypotheses_agree(asked, unanimous, pending):
-    found = _plain()._replace(score=jnp.array(0.7))
-    others = Alternatives(jax.tree.map(lambda leaf: leaf[None], rigid.identity()), jnp.array([10.0]))
-    search = Search(sure=asked * float(confidence_of_samples(found.score, others)))
-    assert bool(stages.judge_quick_look(search, found, np.bool_(unanimous), others).pending) == pending
+    judged = stages.judge_quick_look(Search(sure=0.4 * asked), _plain(), np.bool_(unanimous), np.float32(0.4))
+    assert bool(judged.pending) == pending
 
 
 def test_a_quick_look_at_another_shape_is_not_sure(look, cloud):
     box = np.random.default_rng(0).uniform(-1, 1, cloud.shape).astype(np.float32)
     assert bool(look(cloud, box).pending)
+
+
+def test_a_quick_look_at_samples_is_judged_by_whole_clouds(partial):
+    source, target = (stages.prepare(_SIZES, cloud) for cloud in _normalized(*map(_pad, partial(120))))
+    box = np.random.default_rng(0).uniform(-1, 1, (200, 3)).astype(np.float32)
+    other = stages.prepare(_SIZES, _normalized(_pad(box), _pad(box))[0])._replace(samples=source.samples)
+    look = lambda whole: stages._look_quickly((ICP(), _SMALL), whole, target, _plain(), _TOLD)  # noqa: E731
+    assert not look(source).pending
+    assert look(other).pending
 
 
 @pytest.mark.parametrize(

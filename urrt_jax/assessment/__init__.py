@@ -5,7 +5,7 @@
 """
 
 from urrt_jax.assessment.alternatives import Alternatives, find_alternatives
-from urrt_jax.assessment.confidence import Confidence, confidence, confidence_of_samples, measure, odds
+from urrt_jax.assessment.confidence import Confidence, confidence, measure, odds
 from urrt_jax.assessment.fit import Fit, agreement, fit, fit_samples, inlier_share, well_posed
 from urrt_jax.assessment.precision import Precision, information, moved_covariance, moved_information, precision
 
@@ -16,7 +16,6 @@ __all__ = [
     "Precision",
     "agreement",
     "confidence",
-    "confidence_of_samples",
     "find_alternatives",
     "fit",
     "fit_samples",

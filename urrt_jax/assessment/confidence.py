@@ -62,18 +62,6 @@ def confidence(measured: Array) -> Confidence:
     return Confidence(*(jax.nn.sigmoid(_logit(check, measured)) for check in CHECKS))
 
 
-def confidence_of_samples(score: Array, others: Alternatives) -> Array:
-    """The confidence, (), in a pose of dense clouds, whose points are enough to determine it, as their samples show it.
-
-    Args:
-      score: (), of the fit of the samples.
-      others: poses that fit the samples about as well.
-    """
-    values = {"score": score, "significance": jnp.min(others.significance)}
-    measured = jnp.stack([values.get(name, jnp.zeros_like(score)) for name in MEASURED])
-    return jax.nn.sigmoid(_logit("surfaces", measured)) * jax.nn.sigmoid(_logit("unique", measured))
-
-
 def odds(others: Alternatives) -> Array:
     """The odds (K,) of each alternative against the pose itself: 1 where both fit alike, 0 where there is none."""
     return jnp.where(others.there, jnp.exp(-CHECKS["unique"]["significance"] * others.significance), 0.0)

@@ -43,8 +43,9 @@ class Search:
       tried: hypotheses that are briefly refined.
       kept: those of them that are refined on the whole subsample.
       inlier_distance: beyond it a point counts as unmatched when poses are compared.
-      sure: the confidence, in [0, 1], of the quick look (at dense clouds, through few points and features alone) from
-        which on its pose is taken and the thorough search is skipped.
+      sure: the confidence, in [0, 1], in the pose of the quick look (at dense clouds, through few points and features
+        alone) from which on it is taken and the thorough search is skipped; half of it, where most of the quick look's
+        hypotheses end there.
     """
 
     points: int = dataclasses.field(default=1024, metadata=_STATIC)

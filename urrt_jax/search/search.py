@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from urrt_jax import rigid
-from urrt_jax.assessment import Alternatives, agreement, confidence_of_samples, fit_samples
+from urrt_jax.assessment import agreement, fit_samples
 from urrt_jax.clouds import Cloud, face_alike, first, normals, subsample
 from urrt_jax.features import fpfh, turned_around
 from urrt_jax.loops import only_if
@@ -83,16 +83,15 @@ def search_quickly(search: Search, source: Samples, target: Samples, plain: Foun
     return _choose([guesses], few, width, plain.transform, search, _QUICK_TRIED)
 
 
-def judge_quick_look(search: Search, found: Found, unanimous: Array, others: Alternatives) -> Found:
+def judge_quick_look(search: Search, found: Found, unanimous: Array, confidence: Array) -> Found:
     """What a quick look has found; ``pending`` where it is not sure enough.
 
     Args:
       search: how it was searched.
       found: the best pose.
       unanimous: (), bool, whether most of the best hypotheses ended in it.
-      others: poses that fit the samples about as well.
+      confidence: (), in this pose, once it is refined, as whole clouds show it.
     """
-    confidence = confidence_of_samples(found.score, others)
     settled = (confidence >= search.sure) | (unanimous & (confidence >= _UNANIMOUSLY * search.sure))
     return found._replace(pending=~settled)
 
