@@ -195,7 +195,7 @@ RESULTS = (
     f"The default call finds {_figure('default_call', 'scans', 'register', 'recall_5deg_0.05', 1):.3f} of them, "
     f"and the best peer {_best_of_peers('scans', 'recall_5deg_0.05'):.3f}",
     f"{_range('beyond_5', _SIZES)} % are more than 5° wrong",
-    f"{_range('beyond_45', [row for row in _SIZES if row['pairs_of'] != '2048 points'])} % are more than 45° wrong",
+    f"{_range('beyond_45', [row for row in _SIZES if row['pairs_of'] != '4096 points'])} % are more than 45° wrong",
     f"at least {int(100 * min(row['right_asymmetric_called'] for row in _SIZES[3:]))} % of the right poses",
     f"of solids without any symmetry, {100 * min(row['right_solids_called'] for row in _SIZES[3:]):.0f} %",
     f"{100 * (1 - _SIZES[1]['right_called']):.1f} % of them at 64 points",

@@ -21,7 +21,7 @@ from urrt_jax.prepared import Sizes, coarser
 from urrt_jax.refine import ICP
 from urrt_jax.rigid import Known
 from urrt_jax.search import Found, Search
-from urrt_jax.search.search import DENSE, FINALISTS, _finalists, _similarity, search_thoroughly
+from urrt_jax.search.search import DENSE, FINALISTS, _finalists, _refine, _scores, _similarity, search_thoroughly
 
 _SMALL = Search(points=128, matches=16, landmarks=0, tried=16)
 _SIZE = 256
@@ -315,6 +315,22 @@ def test_points_of_dense_clouds_are_compared_by_neighborhoods_of_two_sizes(cloud
     one = make_cloud(*_pad(cloud))
     alike = _similarity((SimpleNamespace(thinned=one),) * 2, (one, one), jnp.array(0.2), Search(), jnp.array(dense))
     np.testing.assert_allclose(jnp.diagonal(alike)[: len(cloud)], sizes, atol=1e-4)
+
+
+@pytest.mark.parametrize("groups", [1, 2, 3, 9])
+def test_only_the_first_groups_of_poses_are_refined_and_scored(cloud, groups):
+    """Of seven poses, three at a time; there are three groups, of which the last is not whole."""
+    few = (make_cloud(*_pad(cloud)),) * 2
+    turns = np.stack([_turn(4.0 + row) for row in range(7)]).astype(np.float32)
+    poses = rigid.Rigid(jnp.asarray(turns), jnp.zeros((7, 3)))
+    refined = jax.jit(lambda: _refine(poses, few, jnp.array(0.2), 3, groups))()
+    scores = jax.jit(lambda: _scores(poses, few, jnp.array(0.2), 3 * groups))()
+    there = np.arange(7) < 3 * groups
+    angles = np.array([_degrees(turn, np.eye(3)) for turn in refined.rotation])
+    assert refined.rotation.shape == (7, 3, 3)
+    assert (angles[there] < 0.5).all()
+    np.testing.assert_array_equal(refined.rotation[~there], turns[~there])
+    np.testing.assert_array_equal(np.isfinite(scores), there)
 
 
 @pytest.mark.parametrize(("dense", "pending"), [(DENSE, False), (100, True)])

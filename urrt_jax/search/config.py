@@ -41,7 +41,8 @@ class Search:
         Among poses that fit alike, which symmetric shapes have, the one that turns least is then chosen. A tenth of it
         where both clouds have 4,096 points or more, which tell such poses apart.
       tried: hypotheses that are briefly refined.
-      kept: those of them that are refined on the whole subsample.
+      kept: those of them that are refined on the whole subsample; about four times as many where both clouds have 4,096
+        points or more.
       inlier_distance: beyond it a point counts as unmatched when poses are compared.
       sure: the confidence, in [0, 1], in the pose of the quick look (at dense clouds, through few points and features
         alone) from which on it is taken and the thorough search is skipped; half of it, where most of the quick look's

@@ -4,10 +4,14 @@ Hypotheses come from matched features (``matches``), which partial overlap and a
 network's landmarks (``model.network.propose``), which sparse and noisy clouds leave alone. Nothing is drawn at random.
 
 The 64 hypotheses in which the clouds agree best, in both directions, are refined briefly on few points. The best four
-of these and the plain pose are refined on the whole subsample, and the one that fits best is kept. Dense clouds, such
-as scans, get a quick look first, at 512 points and their features alone. Its pose is taken where it fits well, or where
-most of the best hypotheses end in it. (These numbers are the defaults of ``Search``.) Otherwise the three best poses of
-the thorough search that are far from each other are refined, and the one in which the whole clouds fit best is kept.
+of these and the plain pose are refined on the whole subsample, and the one that fits best is kept.
+
+Dense clouds, such as scans, get a quick look first, at 512 points and their features alone. Its pose is taken where it
+fits well, or where most of the best hypotheses end in it. Otherwise the thorough search refines 19 poses instead of
+four. The three best that are far from each other are refined once more, among more points, and the one in which the
+whole clouds then fit best is kept.
+
+(These numbers are the defaults of ``Search``.)
 """
 
 import dataclasses
@@ -36,6 +40,7 @@ _NEARLY = 1.5  # inlier distances that a pose may be off before it is refined on
 _QUICK_MATCHES, _QUICK_TRIED = 32, 16  # hypotheses of the quick look, and those of them that are briefly refined
 _RADII = (1.0, 0.6)  # of features, as shares of the search's radius; sparse clouds have those of the first alone
 _VOTES = 16  # steps in which neighbours' normals are made to agree
+_GROUPS = 4  # of poses that are refined in full in a thorough search of dense clouds: little of these may overlap
 _SEEDS = 4  # poses from matches for each hypothesis that is kept of them
 _ALIKE = 5.0  # degrees between poses that are the same
 _CHEAPER = 0.1  # what turns cost dense clouds, which tell nearly symmetric poses apart better than sparse ones do
@@ -100,9 +105,9 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     """The best pose among all hypotheses.
 
     They are told apart by how well the subsamples lie on each other in both directions: the best ``tried`` of them as
-    they are, the best ``kept`` of these after a brief refinement on few points, the best one after a full one. Where
-    none turns by less than the largest angle, it is ``plain``, with a score of 0. Of dense clouds it is still to be
-    verified.
+    they are, the best ``kept`` of these after a brief refinement on few points, the best one after a full one. Of dense
+    clouds, of which little may overlap, about four times as many are kept; the pose found is still to be verified.
+    Where none turns by less than the largest angle, it is ``plain``, with a score of 0.
 
     Arguments as for ``search_quickly``, and the network that proposes hypotheses from its landmarks.
     """
@@ -117,7 +122,8 @@ def search_thoroughly(options: tuple[Search, Model], source: Samples, target: Sa
     if search.landmarks:
         seen = first(source.even, model.config.points), first(target.even, model.config.points)
         guesses.append(propose(model, *seen, search.landmarks))
-    found, _ = _choose(guesses, few, width, plain.transform, search, search.tried)
+    groups = jnp.where(dense, _GROUPS, 1)
+    found, _ = _choose(guesses, few, width, plain.transform, search, search.tried, groups)
     return found._replace(pending=dense)
 
 
@@ -140,9 +146,18 @@ def choose_finalist(search: Search, found: Found, refined: Rigid, scores: Array)
 
 
 def _choose(
-    guesses: list[Rigid], few: tuple[Cloud, Cloud], width: Array, plain: Rigid, search: Search, tried: int
+    guesses: list[Rigid],
+    few: tuple[Cloud, Cloud],
+    width: Array,
+    plain: Rigid,
+    search: Search,
+    tried: int,
+    groups: Array | int = 1,
 ) -> tuple[Found, Array]:
-    """The best of ``plain`` and all guesses, in three rounds, and whether several guesses end there, ()."""
+    """The best of ``plain`` and all guesses, in three rounds, and whether several guesses end there, ().
+
+    In the last round ``groups`` times as many are refined as ``search.kept`` says, at most ``_GROUPS`` times.
+    """
     reach = search.inlier_distance * width
     fewer = first(few[0], _COARSE_POINTS), first(few[1], _COARSE_POINTS)
     every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *guesses)
@@ -153,20 +168,51 @@ def _choose(
     brief = jax.vmap(lambda pose: anneal(fewer[0], denser, pose, 3 * coarse, coarse, iterations=_BRIEF_STEPS))(
         promising
     )
-    kept, _ = _best(brief, agreement(brief, few, fewer, _NEARLY * reach), search.kept, search)
+    size = search.kept + 1
+    kept, _ = _best(brief, agreement(brief, few, fewer, _NEARLY * reach), _GROUPS * size - 1, search)
 
     # The plain pose is always among them, as it is and refined in full: it stays where none fits better.
-    kept = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others]), plain, kept)
-    full = jax.vmap(lambda pose: anneal(*few, pose, 3 * reach, reach, iterations=_STEPS))(kept)
-    full = jax.tree.map(lambda own, others: jnp.concatenate([own[None], others]), plain, full)
+    full = _refine(_with_first(plain, kept), few, reach, size, groups)
+    full = _with_first(plain, full)
     # Not their agreement: where little overlaps, more points touch in poses in which surfaces cross.
-    scores = jax.lax.map(lambda pose: fit_samples(*few, pose, width).score, full)
+    scores = _scores(full, few, width, groups * size + 1)
     poses, best = _best(full, scores, 1, search)
     found = jax.tree.map(lambda leaf, given: jnp.where(best[0] >= 0, leaf[0], given), poses, plain)
-    alike = rigid.rotation_angle(full.rotation[2:], found.rotation) < jnp.deg2rad(_ALIKE)
-    unanimous = jnp.sum(alike) > 0.5 * alike.shape[0]
+    alike = rigid.rotation_angle(full.rotation, found.rotation) < jnp.deg2rad(_ALIKE)
+    guessed = jnp.isfinite(scores).at[:2].set(False)
+    unanimous = jnp.sum(alike & guessed) > 0.5 * jnp.sum(guessed)
     finalists = _finalists(found, full, scores, search)
     return Found(found, jnp.maximum(best[0], 0.0), width, jnp.array(False), finalists), unanimous
+
+
+def _refine(poses: Rigid, few: tuple[Cloud, Cloud], reach: Array, size: int, groups: Array | int) -> Rigid:
+    """H poses, of which the first ``groups`` times ``size`` are refined in full, ``size`` at a time."""
+    count = len(poses.translation)
+    poses = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -count % size, axis=0)]), poses)
+
+    def refine_group(group: Array, poses: Rigid) -> Rigid:
+        some = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, group * size, size), poses)
+        ends = jax.vmap(lambda pose: anneal(*few, pose, 3 * reach, reach, iterations=_STEPS))(some)
+        put = jax.lax.dynamic_update_slice_in_dim
+        return jax.tree.map(lambda leaf, new: put(leaf, new, group * size, axis=0), poses, ends)
+
+    groups = jnp.minimum(groups, len(poses.translation) // size)
+    return jax.tree.map(lambda leaf: leaf[:count], jax.lax.fori_loop(0, groups, refine_group, poses))
+
+
+def _scores(poses: Rigid, few: tuple[Cloud, Cloud], width: Array, count: Array | int) -> Array:
+    """How well the clouds fit in the first ``count`` of H poses, (H,); -inf for the others."""
+
+    def score(row: Array, scores: Array) -> Array:
+        return scores.at[row].set(fit_samples(*few, jax.tree.map(lambda leaf: leaf[row], poses), width).score)
+
+    rows = len(poses.translation)
+    return jax.lax.fori_loop(0, jnp.minimum(count, rows), score, jnp.full(rows, -jnp.inf, width.dtype))
+
+
+def _with_first(pose: Rigid, poses: Rigid) -> Rigid:
+    """The poses, with one more in front."""
+    return jax.tree.map(lambda own, others: jnp.concatenate([own[None], others]), pose, poses)
 
 
 def _finalists(found: Rigid, poses: Rigid, scores: Array, search: Search) -> Rigid:
@@ -178,7 +224,7 @@ def _finalists(found: Rigid, poses: Rigid, scores: Array, search: Search) -> Rig
     scores = jnp.where(far & _worth(poses, scores, search)[1], scores, -jnp.inf)
     rows, there = rigid.distinct(poses, scores, count=FINALISTS - 1, apart=_APART)
     others = jax.vmap(lambda row, is_there: rigid.choose(is_there, jax.tree.map(lambda leaf: leaf[row], poses), found))
-    return jax.tree.map(lambda own, leaf: jnp.concatenate([own[None], leaf]), found, others(rows, there))
+    return _with_first(found, others(rows, there))
 
 
 def _best(poses: Rigid, scores: Array, count: int, search: Search) -> tuple[Rigid, Array]:
