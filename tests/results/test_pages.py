@@ -240,9 +240,10 @@ def test_page_of_benchmarks_says_which_goals_are_missed():
         cache: {name: case[cache][case["headline"]] / case["asked"][cache] for name, case in cases.items()}
         for cache in ("empty", "filled")
     }
-    assert [name for name, share in over["empty"].items() if share <= 1] == ["folder", "help"]
-    assert [name for name, share in over["filled"].items() if share > 1] == ["scans", "demo", "register"]
-    assert max(over["filled"].values()) < 1.1
+    assert [name for name, share in over["empty"].items() if share <= 1] == ["help"]
+    least, most = (100 * (pick(over["filled"].values()) - 1) for pick in (min, max))
+    assert least > 0
+    assert f"all goals are missed, by {least:.0f} to {most:.0f} %" in TEXTS["experiments/benchmarks/README.md"]
     each = cases["folder"]["filled"]["whole"] / len(cases["folder"]["pairs"])
     assert f"takes {each:.2f} s, reading" in " ".join(TEXTS["experiments/benchmarks/README.md"].split())
 

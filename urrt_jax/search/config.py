@@ -61,7 +61,7 @@ class Search:
     tried: int = dataclasses.field(default=64, metadata=_STATIC)
     kept: int = dataclasses.field(default=4, metadata=_STATIC)
     inlier_distance: float = 1.5
-    sure: float = 0.8
+    sure: float = 0.9
 
     def __post_init__(self) -> None:
         check_whole(self, most=_MOST, points=16, matches=0, support=3, landmarks=0, tried=1, kept=1)
