@@ -78,8 +78,8 @@ STEPS_BEFORE_REFINEMENT = 2
 _SMALLEST_RUNG, _FACTOR = 256, 4
 _SAMPLE = 512  # points of the even subsample, at least
 # What the plain pose is worth on the subsample (``Fit.score`` less what its turn costs), below which a search is called
-# for. Dense clouds are searched more readily, because their quick look is cheap. Chosen on training
-# shapes and bunny pairs.
+# for. Dense clouds are searched more readily, because their quick look is cheap. Chosen on training shapes; for dense
+# clouds, on bunny pairs and views of made-up solids.
 _FITS, _FITS_DENSE = 0.78, 0.92
 _COARSE_GRID, _LOST_GRID = 0.1, 1.0
 """The step between float32 coordinates, in spacings, from which on lost digits explain a failure, and from which on no

@@ -160,7 +160,7 @@ _HONEST = load("confidence")
 def test_few_of_the_poses_called_converged_are_wrong_at_any_number_of_points(row):
     assert row["called"] >= 50
     assert row["beyond_5"] <= 0.05
-    # 1 %, or two pairs: at 4,096 points these are two of 123, views that overlap little.
+    # 1 %, or two pairs: at 4,096 points these are two of 123.
     assert row["beyond_45"] * row["called"] <= max(2.01, 0.01 * row["called"])
 
 

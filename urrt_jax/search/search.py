@@ -40,7 +40,9 @@ _NEARLY = 1.5  # inlier distances that a pose may be off before it is refined on
 _QUICK_MATCHES, _QUICK_TRIED = 32, 16  # hypotheses of the quick look, and those of them that are briefly refined
 _RADII = (1.0, 0.6)  # of features, as shares of the search's radius; sparse clouds have those of the first alone
 _VOTES = 16  # steps in which neighbours' normals are made to agree
-_GROUPS = 4  # of poses that are refined in full in a thorough search of dense clouds: little of these may overlap
+# Groups of poses that a thorough search of dense clouds refines in full, instead of one: where little overlaps, the
+# right pose ranks low before that.
+_GROUPS = 4
 _SEEDS = 4  # poses from matches for each hypothesis that is kept of them
 _ALIKE = 5.0  # degrees between poses that are the same
 _CHEAPER = 0.1  # what turns cost dense clouds, which tell nearly symmetric poses apart better than sparse ones do
